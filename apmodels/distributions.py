@@ -1,0 +1,146 @@
+"""Distributions as trees of tensors, so that a law written for one world can be evaluated for many.
+
+A distribution is taken apart into its tensors and put together again around tensors with leading dimensions;
+nothing here knows one family from another.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution, Independent, constraints
+from torch.distributions.transforms import Transform
+
+from apmodels.errors import ValueOutOfRange
+from apmodels.planted import Planted
+
+
+@contextmanager
+def unvalidated() -> Iterator[None]:
+    """Build distributions without checking their parameters; inside vmap nothing can be checked."""
+    before = Distribution._validate_args
+    Distribution.set_default_validate_args(False)
+    try:
+        yield
+    finally:
+        Distribution.set_default_validate_args(before)
+
+
+def rebuilt(thing: Any, visit: Callable[[Tensor], Tensor], lead: tuple[int, ...] = (), drop: int = 0) -> Any:
+    """Return a copy in which each tensor t is ``visit(t)``, and ``lead`` replaces ``drop`` batch dimensions."""
+    if isinstance(thing, Tensor):
+        return visit(thing)
+    if isinstance(thing, (list, tuple)) and not isinstance(thing, torch.Size):
+        return type(thing)(rebuilt(part, visit, lead, drop) for part in thing)
+    if isinstance(thing, (Distribution, Transform)):
+        new = copy.copy(thing)
+        new.__dict__.update({key: rebuilt(value, visit, lead, drop) for key, value in vars(thing).items()})
+        if isinstance(new, Distribution):
+            new._batch_shape = torch.Size(lead) + thing._batch_shape[drop:]
+        return new
+    return thing
+
+
+def tensors(thing: Any) -> list[Tensor]:
+    """Return the tensors of a distribution in a fixed order."""
+    found: list[Tensor] = []
+
+    def note(tensor: Tensor) -> Tensor:
+        found.append(tensor)
+        return tensor
+
+    rebuilt(thing, note)
+    return found
+
+
+def with_tensors(
+    thing: Any, parts: list[Tensor] | tuple[Tensor, ...], lead: tuple[int, ...], drop: int = 0
+) -> Any:
+    """Return ``thing`` around other tensors, each with ``lead`` instead of its first ``drop`` dimensions."""
+    remaining = iter(parts)
+    return rebuilt(thing, lambda _: next(remaining), lead, drop)
+
+
+def picked(law: Any, index: Any, lead: tuple[int, ...], drop: int) -> Any:
+    """Return a batch of laws indexed in its first ``drop`` batch dimensions, which become ``lead``."""
+    return with_tensors(law, [part[index] for part in tensors(law)], lead, drop)
+
+
+def compact(value: Tensor) -> Tensor:
+    """Return an expanded tensor with size 1 where it only repeats itself."""
+    for dim, (size, stride) in enumerate(zip(value.shape, value.stride(), strict=True)):
+        if size > 1 and stride == 0:
+            value = value.narrow(dim, 0, 1)
+    return value
+
+
+def base_of(distribution: Any) -> tuple[Any, int]:
+    """Strip ``to_event``: return the elementwise distribution and the number of event dimensions added."""
+    added = 0
+    while isinstance(distribution, Independent):
+        added += distribution.reinterpreted_batch_ndims
+        distribution = distribution.base_dist
+    return distribution, added
+
+
+def log_prob_of(distribution: Any, value: Tensor) -> Tensor:
+    """Return log p(value) in nats, in which elements that are NaN are missing; for scalars and ``to_event`` arrays."""
+    base, added = base_of(distribution)
+    if isinstance(base, Planted) or len(base.event_shape) or not value.is_floating_point():
+        return distribution.log_prob(value)
+    missing = torch.isnan(value)
+    scores = torch.where(missing, 0.0, base.log_prob(torch.where(missing, 0.0, value)))
+    return scores.sum(tuple(range(-added, 0))) if added else scores
+
+
+def family(distribution: Any) -> str:
+    """Return the family's name: 'Normal', 'Categorical' ..."""
+    return type(base_of(distribution)[0]).__name__
+
+
+def parameters(distribution: Any) -> dict[str, Tensor]:
+    """Return the parameters that were given to the elementwise distribution, by name."""
+    base, _ = base_of(distribution)
+    names = base.arg_constraints
+    given = {name: vars(base)[name] for name in names if isinstance(vars(base).get(name), Tensor)}
+    return given or {name: getattr(base, name) for name in names if name != "logits"}
+
+
+def check_parameters(distribution: Any, where: str) -> None:
+    """Raise ValueOutOfRange, naming ``where``, if a parameter violates its family's constraint."""
+    base, _ = base_of(distribution)
+    for part in vars(base).values():
+        if isinstance(part, Distribution):
+            check_parameters(part, where)
+    for name, value in parameters(distribution).items():
+        constraint = base.arg_constraints[name]
+        if constraints.is_dependent(constraint):
+            continue
+        value = compact(value)
+        # A NaN passes no constraint but those that ask nothing; an infinite location says nothing either.
+        good = constraint.check(value)
+        if name == "loc" or name == "probs":
+            good = good & torch.isfinite(value).all(-1) if good.dim() < value.dim() else good & torch.isfinite(value)
+        if not bool(good.all()):
+            bad = value[~good] if good.shape == value.shape else value[~good].flatten()
+            raise ValueOutOfRange(
+                f"{where} is {type(base).__name__} with {name} = {bad.flatten()[0]:g}, "
+                f"which is outside {_words(constraint)}"
+            )
+
+
+def _words(constraint: Any) -> str:
+    named = {
+        "Interval": "[0, 1]",
+        "GreaterThan": "the positive numbers",
+        "GreaterThanEq": "the numbers from 0 up",
+        "Simplex": "the probabilities that sum to 1",
+        "Real": "the finite numbers",
+        "IndependentConstraint": "the finite numbers",
+    }
+    return named.get(type(constraint).__name__.lstrip("_"), str(constraint))

@@ -1,0 +1,67 @@
+"""Fields of independent elements that are all alike but one."""
+
+from __future__ import annotations
+
+import torch
+from pyro.distributions import TorchDistribution
+from torch import Tensor
+from torch.distributions import Distribution, constraints
+
+
+class Planted(TorchDistribution):
+    """Independent elements: the one at ``index`` follows ``here``, all others follow ``elsewhere``.
+
+    The same law can be written with a one-hot mean; said like this, neither its table nor its likelihood ever
+    touches the elements that do not differ, so that a model with N places costs N per look and not N².
+
+    Args:
+        index: which element differs, int64, (*batch,).
+        here: the law of that element, batch shape (*batch,).
+        elsewhere: the laws of all elements where nothing is planted, batch shape (*batch, elements), of the same
+            family as ``here``.
+    """
+
+    arg_constraints = {}
+    support = constraints.real_vector
+    has_rsample = False
+
+    def __init__(
+        self, index: Tensor, here: Distribution, elsewhere: Distribution, validate_args: bool | None = None
+    ):
+        if type(here) is not type(elsewhere) or here.event_shape != elsewhere.event_shape:
+            raise TypeError(
+                f"Planted needs one family for both laws, not {type(here).__name__} and {type(elsewhere).__name__}"
+            )
+        self.index = torch.as_tensor(index)
+        self.here = here
+        self.elsewhere = elsewhere
+        batch = elsewhere.batch_shape[:-1]
+        super().__init__(batch, elsewhere.batch_shape[-1:] + elsewhere.event_shape, validate_args=False)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Return log p(value), nats; elements that are NaN are missing."""
+        background = _present(self.elsewhere, value)
+        lead = torch.broadcast_shapes(value.shape[:-1], self.index.shape, background.shape[:-1])
+        index = self.index.expand(lead).unsqueeze(-1)
+        inside = value.expand(*lead, value.shape[-1]).gather(-1, index).squeeze(-1)
+        replaced = background.expand(*lead, value.shape[-1]).gather(-1, index).squeeze(-1)
+        return background.sum(-1) - replaced + _present(self.here, inside)
+
+    def sample(self, sample_shape: torch.Size | tuple = ()) -> Tensor:  # type: ignore[override]
+        """Draw values, (*sample_shape, *batch, elements)."""
+        drawn = self.elsewhere.sample(torch.Size(sample_shape))
+        index = self.index.unsqueeze(-1).expand(*drawn.shape[:-1], 1)
+        return drawn.scatter(-1, index, self.here.sample(torch.Size(sample_shape)).unsqueeze(-1))
+
+    @property
+    def mean(self) -> Tensor:
+        """The mean of every element, (*batch, elements)."""
+        mean = self.elsewhere.mean
+        return mean.scatter(-1, self.index.unsqueeze(-1), self.here.mean.unsqueeze(-1))
+
+
+def _present(law: Distribution, value: Tensor) -> Tensor:
+    if not value.is_floating_point():
+        return law.log_prob(value)
+    missing = torch.isnan(value)
+    return torch.where(missing, 0.0, law.log_prob(torch.where(missing, 0.0, value)))

@@ -1,0 +1,44 @@
+"""Bodies: what turns an action into the next observation, and the devices under them."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hardware.body import Body as Body
+    # The digital eye.
+    from hardware.detectors import CascadeDetector as CascadeDetector
+    from hardware.detectors import Detector as Detector
+    from hardware.detectors import LBPDetector as LBPDetector
+    from hardware.fovea import Fovea as Fovea
+    from hardware.photo import PhotoError as PhotoError
+    from hardware.photo import read_photo as read_photo
+    from hardware.photo_eye import PhotoEye as PhotoEye
+    from hardware.photo_eye import whole_image as whole_image
+    from hardware.simulated import Simulated as Simulated
+
+# Public names and their files.  They are imported when first used, so that `import hardware` is quick.
+_FILES = {
+    "Body": "body",
+    "Simulated": "simulated",
+    # The digital eye.
+    "CascadeDetector": "detectors",
+    "Detector": "detectors",
+    "LBPDetector": "detectors",
+    "Fovea": "fovea",
+    "PhotoError": "photo",
+    "read_photo": "photo",
+    "PhotoEye": "photo_eye",
+    "whole_image": "photo_eye",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first asked for."""
+    if name in _FILES:
+        return getattr(import_module(f"hardware.{_FILES[name]}"), name)
+    raise AttributeError(f"module 'hardware' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    """All public names."""
+    return [*globals(), *_FILES]

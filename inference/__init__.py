@@ -1,0 +1,12 @@
+"""Engines: a model and a history become a belief."""
+
+from inference.beliefs import Belief as Belief
+from inference.beliefs import FiniteBelief as FiniteBelief
+from inference.beliefs import Marginal as Marginal
+from inference.choose import bids as bids
+from inference.choose import choose as choose
+from inference.choose import explain as explain
+from inference.engine import Bid as Bid
+from inference.engine import Engine as Engine
+from inference.engine import Refusal as Refusal
+from inference.exact import Exact as Exact

@@ -1,0 +1,68 @@
+"""What an engine knows after a history: an immutable value of batched tensors."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from pyro.distributions import Categorical
+from torch import Tensor
+
+
+class Marginal(Categorical):
+    """The distribution of a variable with finitely many values: ``probs`` (*batch, size) over ``values``.
+
+    Samples are positions in ``values`` (size, *shape); ``mean`` and ``mode`` are in the variable's own units.
+    """
+
+    def __init__(self, log_probs: Tensor, values: Tensor):
+        super().__init__(logits=log_probs, validate_args=False)
+        self.values = values
+
+    @property
+    def mean(self) -> Tensor:
+        """The expected value, (*batch, *shape)."""
+        values = self.values.to(self.probs.dtype)
+        return torch.tensordot(self.probs, values, dims=1)
+
+    @property
+    def mode(self) -> Tensor:
+        """The most probable value, (*batch, *shape); the first of several."""
+        return self.values[self.logits.argmax(-1)]
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What every belief has. ``batch`` is None for a single one.
+
+    ``log_evidence`` (*batch,) is log p(observations | actions) so far, in nats; ``time`` counts steps; ``known``
+    holds what the agent need not infer but must remember.
+    """
+
+    engine: Any = field(repr=False, compare=False)
+    batch: int | None
+    time: int
+    log_evidence: Tensor = field(repr=False)
+    known: dict[str, Tensor] = field(repr=False)
+
+    def marginal(self, name: str) -> Any:
+        """Return the distribution of a hidden variable."""
+        return self.engine.marginal(self, name)
+
+    def entropy(self, names: str | tuple[str, ...] | None = None, bits: bool = False) -> Tensor:
+        """Return the joint entropy of variables, the interest by default, in nats or bits, (*batch,)."""
+        entropy = self.engine.entropy(self, names)
+        return entropy / math.log(2) if bits else entropy
+
+    def most_probable(self, name: str | None = None) -> Tensor:
+        """Return the most probable value of a variable, of the interest by default, (*batch, *shape)."""
+        return self.engine.most_probable(self, name)
+
+
+@dataclass(frozen=True)
+class FiniteBelief(Belief):
+    """Log probabilities (batch or 1, *sizes) over the joint values of the hidden variables, normalised."""
+
+    log_probs: Tensor = field(repr=False)

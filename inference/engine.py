@@ -1,0 +1,124 @@
+"""What every engine does, and the part of it that does not depend on how."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from apmodels import Model, ValueOutOfRange
+from apmodels.laws import Laws
+from apmodels.simulation import Values, as_dict, check_actions
+from apmodels.structure import Structure
+from inference.beliefs import Belief
+
+
+class Refusal(TypeError):
+    """An engine cannot serve a model; the message names the variable and the reason."""
+
+
+@dataclass(frozen=True)
+class Bid:
+    """How well an engine serves a structure, from 0 (not at all) to 1 (nothing can do better), and why."""
+
+    competence: float
+    reason: str
+
+    def __bool__(self) -> bool:
+        return self.competence > 0
+
+
+class Engine(ABC):
+    """Turns a model and a history into a belief. It reads the model's structure and never asks which model it is.
+
+    Args:
+        model: the model.
+        dtype: the precision of beliefs and of the laws, torch's default if None.
+    """
+
+    def __init__(self, model: Model, dtype: torch.dtype | None = None):
+        self.model = model
+        self.structure: Structure = model.structure
+        bid = self.bid(self.structure)
+        if not bid:
+            raise Refusal(f"{type(self).__name__} cannot serve {type(model).__name__}: {bid.reason}")
+        self.laws = Laws(model, dtype)
+        self.dtype = self.laws.dtype
+
+    @classmethod
+    @abstractmethod
+    def bid(cls, structure: Structure) -> Bid:
+        """Say how well this engine serves a structure."""
+
+    @abstractmethod
+    def start(self, batch: int | None = None) -> Belief:
+        """Return the belief before any data; without ``batch``, a single one."""
+
+    @abstractmethod
+    def update(self, belief: Any, action: Any, observation: Any) -> Any:
+        """Return the belief after one more action and observation.
+
+        Args:
+            belief: unharmed, whatever happens.
+            action: a tensor (*batch, *shape), a dict of them by name where the model has several actions, None
+                where it has none. One that has no batch dimension goes for the whole batch.
+            observation: likewise; NaN elements are missing.
+
+        Raises:
+            ValueOutOfRange: an action outside its space, an observation of the wrong shape, infinite or impossible.
+        """
+
+    @abstractmethod
+    def forecast(self, belief: Any, action: Any) -> Any:
+        """Return the predictive distribution of the next observation; a dict by name where there are several."""
+
+    @abstractmethod
+    def gain(self, belief: Any, actions: Any = None, samples: int = 64, seed: int = 0) -> Tensor:
+        """Return the expected information about the interest, in nats, (*batch, K), of each of K actions.
+
+        ``actions`` (K, *shape), all values of a finite action by default. Exact where the observation has few
+        outcomes, otherwise an average over ``samples`` imagined observations, with common random numbers.
+        """
+
+    def filter(self, actions: Any, observations: Any, batch: int | None = None) -> list[Any]:
+        """Return the beliefs after each step of a record, (steps, *shape) or (batch, steps, *shape)."""
+        acts = as_dict(actions, self.model.action_names, "action")
+        seen = as_dict(observations, self.model.observation_names, "observation")
+        beliefs = []
+        belief = self.start(batch)
+        at = 0 if batch is None else 1
+        for t in range(next(iter(seen.values())).shape[at]):
+            act = {name: value.select(at, t) for name, value in acts.items()}
+            belief = self.update(belief, act or None, {name: v.select(at, t) for name, v in seen.items()})
+            beliefs.append(belief)
+        return beliefs
+
+    # What users pass, checked and with a batch dimension.
+
+    def _actions(self, action: Any, batch: int) -> Values:
+        names = self.model.action_names
+        checked = check_actions(self.model, as_dict(action, names, "action"))
+        return {name: self._batched(name, value, self.model.space(name).shape, batch) for name, value in checked.items()}
+
+    def _observations(self, observation: Any, batch: int) -> Values:
+        names = self.model.observation_names
+        seen = {}
+        for name, value in as_dict(observation, names, "observation").items():
+            shape = self.structure.nodes[name].shape
+            value = value if value.dtype == self.dtype else value.to(self.dtype)
+            seen[name] = self._batched(name, value, shape, batch).reshape(batch, -1)
+        return seen
+
+    def _batched(self, name: str, value: Tensor, shape: tuple[int, ...], batch: int) -> Tensor:
+        if tuple(value.shape) == shape:
+            return value.expand(batch, *shape)
+        if tuple(value.shape) == (batch, *shape):
+            return value
+        where = f"{type(self.model).__name__}.{name}"
+        raise ValueOutOfRange(
+            f"{where} has shape {tuple(value.shape)}; one value has shape {shape}, and this belief "
+            + (f"holds {batch} of them" if batch > 1 else "holds one")
+        )

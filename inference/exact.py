@@ -1,0 +1,318 @@
+"""The exact engine: every hidden variable has finitely many values, and all of them are weighed (thesis eq. 5.11)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from pyro.distributions import Categorical, MixtureSameFamily
+from rich.progress import track
+from torch import Tensor
+
+from apmodels import Model, ValueOutOfRange
+from apmodels.distributions import compact, tensors, with_tensors
+from apmodels.simulation import Values
+from apmodels.structure import Structure
+from apmodels.variables import Variable
+from inference.beliefs import FiniteBelief, Marginal
+from inference.contexts import Contexts
+from inference.engine import Bid, Engine
+from inference.imagining import information_gain
+from inference.projections import Projections
+from inference.slices import Axis, Context, Key, Slice, supports
+from inference.tables import Table, tabulate
+
+# How many numbers of a law's table are evaluated at a time.
+CHUNK = 40_000_000
+
+
+class Exact(Engine):
+    """Enumerates the hidden values: exact beliefs for models in which all that is hidden is finite.
+
+    Laws are tabulated once over hidden values and contexts (actions, known states) when a context is first met;
+    :meth:`prepare` tabulates all actions at once. Elements of an observation that no hypothesis distinguishes
+    from the common baseline are never scored.
+    """
+
+    def __init__(self, model: Model, dtype: torch.dtype | None = None):
+        super().__init__(model, dtype)
+        values = supports(self.laws, self.structure)
+        hidden = [node for node in self.structure.nodes.values() if node.name in values]
+        self.statics = [Axis(n.name, 0, values[n.name]) for n in hidden if n.role == "static"]
+        self.states = [Axis(n.name, 0, values[n.name]) for n in hidden if n.role == "state"]
+        remembered = self.model.declaration.remembered
+        self.previous = [Axis(axis.name, 1, axis.values) for axis in self.states if axis.name in remembered]
+        self.axes = self.statics + self.states
+        self.sizes = tuple(axis.size for axis in self.axes)
+        self.remembered = [n for n in remembered if n not in values]
+        self.projections = Projections(self)
+        self.contexts = Contexts(self._context_keys(), self._tabulate, self._forget)
+        self._forget()
+
+    @classmethod
+    def bid(cls, structure: Structure) -> Bid:
+        """Serve models whose hidden variables are all finite."""
+        for node in structure.hidden:
+            if node.plan != "enumerated":
+                return Bid(0.0, f"{node.name} is {node.plan}, not enumerated: {node.why}")
+        for arrow in structure.arrows:
+            parent, child = structure.nodes[arrow.parent], structure.nodes[arrow.child]
+            if arrow.lag == 0 and parent.role == child.role == "observation":
+                return Bid(0.0, f"{child.name} depends on {parent.name}, an observation of the same step")
+            if child.role == "observation" and child.family == "Evidence":
+                return Bid(0.0, f"{child.name} is an Evidence, which has no table")
+        sizes = [len(node.values) for node in structure.hidden if node.values is not None]
+        return Bid(1.0, f"all that is hidden is finite: {' x '.join(map(str, sizes)) or 'nothing'} values")
+
+    def start(self, batch: int | None = None) -> FiniteBelief:
+        """Return the prior: statics by their laws, states at their values before time began."""
+        rows = 1 if batch is None else batch
+        mesh = Slice(self.laws, self.axes, {})
+        log_probs = torch.zeros((1,) * (1 + len(self.axes)), dtype=self.dtype)
+        for axis in self.statics:
+            log_probs = log_probs + mesh.transition(axis)
+        for axis in self.states:
+            log_probs = log_probs + self._before(mesh, axis)
+        log_probs = log_probs.expand(rows, *self.sizes).contiguous()
+        known = {name: _rows(self.laws.before(name), rows) for name in self.remembered}
+        evidence = torch.zeros(() if batch is None else rows, dtype=self.dtype)
+        return FiniteBelief(self, batch, 0, evidence, known, log_probs)
+
+    def update(self, belief: FiniteBelief, action: Any, observation: Any) -> FiniteBelief:
+        """Return the belief after one more action and observation (thesis eqs 5.11 and 5.12)."""
+        count = len(belief.log_probs)
+        actions = self._actions(action, count)
+        seen = self._observations(observation, count)
+        known, context = self.know(belief, actions)
+        rows = self.contexts.rows(context)
+        rows = rows if len(rows) == count else rows.expand(count)
+        evidence: Tensor | float = 0.0
+        early: list[Tensor] = []
+        late: list[Tensor] = []
+        for name, table in self.tables.items():
+            y = table.read(seen[name], f"{type(self.model).__name__}.{name}")
+            ratio = table.ratio(rows, y).reshape(count, *self.shapes[name])
+            evidence = evidence + table.base(rows, y)
+            if self.is_late(name):
+                late.append(self._now(ratio))
+            else:
+                early.append(ratio)
+        log_probs, shift = self.predict(belief.log_probs, rows, early)
+        log_probs = sum(late, start=log_probs)
+        total = log_probs.flatten(1).logsumexp(1)
+        if not math.isfinite(float(total.sum())):
+            raise ValueOutOfRange(f"{type(self.model).__name__} gives what was observed no probability at all")
+        log_probs = log_probs - total.reshape(-1, *[1] * len(self.sizes))
+        evidence = evidence + shift + total
+        evidence = belief.log_evidence + (evidence[0] if belief.batch is None else evidence)
+        kept = self._kept(known | actions, seen) if self.remembered else {}
+        return FiniteBelief(self, belief.batch, belief.time + 1, evidence, kept, log_probs)
+
+    def forecast(self, belief: FiniteBelief, action: Any) -> Any:
+        """Return the predictive distribution of the next observation, a mixture over the hidden values."""
+        count = len(belief.log_probs)
+        _, context = self.know(belief, self._actions(action, count))
+        rows = self.contexts.rows(context).expand(count)
+        mesh = Slice(self.laws, self.statics + self.previous + self.states, context)
+        joint = self.joint(belief.log_probs, rows)
+        made = {}
+        for name in self.tables:
+            law = mesh.law(name)
+            lead = law.batch_shape[1 : 1 + len(mesh.axes)]
+            weights = _summed_to(joint, (count, *lead))
+            flat = torch.Size(lead).numel()
+            parts = [p.expand(count, *p.shape[1:]).reshape(count, flat, *p.shape[1 + len(lead) :]) for p in tensors(law)]
+            components = with_tensors(law, parts, (count, flat), 1 + len(lead))
+            weights = weights.reshape(count, flat)
+            if belief.batch is None:
+                components = with_tensors(components, [p[0] for p in parts], (flat,), 2)
+                weights = weights[0]
+            made[name] = MixtureSameFamily(Categorical(weights), components, validate_args=False)
+        return next(iter(made.values())) if len(made) == 1 else made
+
+    def gain(self, belief: FiniteBelief, actions: Any = None, samples: int = 64, seed: int = 0) -> Tensor:
+        """Return the expected information about the interest, nats, (*batch, K) (thesis eq. 5.4)."""
+        return information_gain(self, belief, actions, samples, seed)
+
+    def prepare(self) -> Exact:
+        """Tabulate the laws for every action now, and return self."""
+        spaces = [(name, self.model.space(name)) for name in self.model.action_names]
+        if any(space.size is None for _, space in spaces) or any(key[0] not in dict(spaces) for key in self.contexts.keys):
+            raise ValueOutOfRange(f"{type(self.model).__name__} has contexts that cannot be listed beforehand")
+        if spaces:
+            values = torch.cartesian_prod(*[torch.arange(space.size or 0) for _, space in spaces])
+            values = values.reshape(-1, len(spaces))
+            self.contexts.rows({(name, 0): s.values()[values[:, i]] for i, (name, s) in enumerate(spaces)})
+        return self
+
+    def marginal(self, belief: FiniteBelief, name: str) -> Marginal:
+        """Return the distribution of a hidden variable over its values."""
+        values, log_probs = self.projections.marginal(belief.log_probs, (name,))
+        return Marginal(_single(belief, log_probs), values[name])
+
+    def entropy(self, belief: FiniteBelief, names: str | tuple[str, ...] | None = None) -> Tensor:
+        """Return the joint entropy of variables in nats, (*batch,)."""
+        return _single(belief, self.projections.entropy(belief.log_probs, self.names(names)))
+
+    def most_probable(self, belief: FiniteBelief, name: str | None = None) -> Tensor:
+        """Return the most probable value of a variable, (*batch, *shape); the first of several."""
+        names = self.names(name)
+        if len(names) != 1:
+            raise ValueOutOfRange(f"the interest is {names}; name one variable")
+        values, log_probs = self.projections.marginal(belief.log_probs, names)
+        return _single(belief, values[names[0]][log_probs.argmax(-1)])
+
+    # Knowing and predicting.
+
+    def names(self, names: str | tuple[str, ...] | None) -> tuple[str, ...]:
+        if names is None:
+            return ("interest",) if self.model.declaration.interest else self.structure.interest
+        return (names,) if isinstance(names, str) else tuple(names)
+
+    def _context_keys(self) -> list[Key]:
+        """What is known and bears, perhaps by way of hidden deterministic variables, on what is hidden or seen."""
+        known = {n.name for n in self.structure.planned("given", "known", "observed")}
+        keys: dict[Key, None] = {}
+        for variable in self.model.declaration.variables.values():
+            if variable.role == "action" or self.structure.nodes[variable.name].plan == "known":
+                continue
+            for parent in variable.parents:
+                if parent.name in known:
+                    keys[parent.name, parent.lag] = None
+        return list(keys)
+
+    def know(self, belief: FiniteBelief, actions: Values) -> tuple[Values, Context]:
+        """Move the known states on; return them and everything known by (name, lag)."""
+        context: Context = {(name, 1): value for name, value in belief.known.items()}
+        context |= {(name, 0): value for name, value in actions.items()}
+        count = len(belief.log_probs)
+        known = {}
+        for node in self.structure.planned("known"):
+            parents = {p.argument: context[p.name, p.lag] for p in self.laws.variables[node.name].parents}
+            law = self.laws.many(node.name, parents, (count,))
+            assert isinstance(law, Tensor)
+            known[node.name] = context[node.name, 0] = law
+        return known, context
+
+    def _kept(self, known: Values, seen: Values) -> Values:
+        """What later steps ask for."""
+        now = {name: y.reshape(len(y), *self.structure.nodes[name].shape) for name, y in seen.items()}
+        return {name: (known | now)[name] for name in self.remembered}
+
+    def _before(self, mesh: Slice, axis: Axis) -> Tensor:
+        if axis.name not in self.model.declaration.remembered:
+            return torch.full((), -torch.tensor(float(axis.size)).log(), dtype=self.dtype)
+        before = self.laws.before(axis.name)
+        here = mesh.along(axis, axis.values)
+        there = mesh.value(before.name) if isinstance(before, Variable) else before.to(here.dtype)
+        same = here == there
+        same = same.flatten(1 + len(mesh.axes)).all(-1) if same.dim() > 1 + len(mesh.axes) else same
+        return same.to(self.dtype).log()
+
+    def is_late(self, name: str) -> bool:
+        """Whether an observation depends on the present alone, and not on how it came about."""
+        first = len(self.statics)
+        return all(n == 1 for n in self.shapes[name][first : first + len(self.previous)])
+
+    def _now(self, ratio: Tensor) -> Tensor:
+        """Drop the (single) dimensions of the past."""
+        first = 1 + len(self.statics)
+        last = first + len(self.previous)
+        return ratio.reshape(ratio.shape[:first] + ratio.shape[last:])
+
+    def predict(self, log_probs: Tensor, rows: Tensor, early: list[Tensor]) -> tuple[Tensor, Tensor | float]:
+        """Return log p(statics, states now, early observations), up to a factor exp(shift), and shift (B,)."""
+        if not self.states:
+            return log_probs, 0.0
+        shift: Tensor | float = 0.0
+        factors = [self._past(log_probs).exp()]
+        for ratio in early:
+            most = ratio.flatten(1).amax(1)
+            factors.append((ratio - most.reshape(-1, *[1] * (ratio.dim() - 1))).exp())
+            shift = shift + most
+        factors += [factor[rows] if len(factor) > 1 else factor for factor in self.transitions]
+        result = _contract(factors, len(self.statics), len(self.previous))
+        return result.log(), shift
+
+    def _past(self, log_probs: Tensor) -> Tensor:
+        """The belief with dimensions (B, statics, previous, 1 for each state now)."""
+        kept = {axis.name for axis in self.previous}
+        first = 1 + len(self.statics)
+        gone = [first + i for i, axis in enumerate(self.states) if axis.name not in kept]
+        past = log_probs.logsumexp(gone) if gone else log_probs
+        return past.reshape(*past.shape, *[1] * len(self.states))
+
+    def joint(self, log_probs: Tensor, rows: Tensor) -> Tensor:
+        """p(statics, states before, states now), (B, statics, previous, states)."""
+        joint = self._past(log_probs).exp()
+        for factor in self.transitions:
+            joint = joint * (factor[rows] if len(factor) > 1 else factor)
+        return joint
+
+    # Tabulating.
+
+    def _forget(self) -> None:
+        self.tables: dict[str, Table] = {}
+        self.shapes: dict[str, tuple[int, ...]] = {}
+        self.transitions: list[Tensor] = []
+
+    def _tabulate(self, context: Context | None) -> None:
+        """Add the tables of K new contexts, a chunk at a time."""
+        count = 1 if context is None else len(next(iter(context.values())))
+        axes = self.statics + self.previous + self.states
+        largest = max(
+            torch.Size(self.structure.nodes[name].shape).numel() for name in self.model.observation_names
+        )
+        step = max(1, CHUNK // max(1, largest * torch.Size(self.sizes).numel()))
+        starts = range(0, count, step)
+        for start in track(starts, "tabulating", transient=True) if len(starts) > 3 else starts:
+            part = {key: value[start : start + step] for key, value in (context or {}).items()}
+            self._append(Slice(self.laws, axes, part))
+
+    def _append(self, mesh: Slice) -> None:
+        first = not self.tables
+        transitions = [mesh.transition(axis).exp() for axis in self.states]
+        if first:
+            self.transitions = transitions
+        else:
+            pairs = zip(self.transitions, transitions, strict=True)
+            self.transitions = [old if len(new) == 1 else torch.cat([old, new]) for old, new in pairs]
+        for name in self.model.observation_names:
+            law = mesh.law(name)
+            shape = tuple(law.batch_shape[1 : 1 + len(mesh.axes)])
+            flat, contexts = torch.Size(shape).numel(), mesh.contexts
+            parts = [p.expand(contexts, *p.shape[1:]) for p in tensors(law)]
+            parts = [p.reshape(contexts, flat, *p.shape[1 + len(shape) :]) for p in parts]
+            table = tabulate(with_tensors(law, parts, (contexts, flat), 1 + len(shape)), contexts, flat)
+            if first:
+                self.tables[name], self.shapes[name] = table, shape
+            else:
+                self.tables[name].append(table)
+
+
+def _single(belief: FiniteBelief, value: Tensor) -> Tensor:
+    return value[0] if belief.batch is None else value
+
+
+def _rows(value: Any, rows: int) -> Tensor:
+    return value.expand(rows, *value.shape)
+
+
+def _summed_to(joint: Tensor, shape: tuple[int, ...]) -> Tensor:
+    dims = [i for i, (n, wanted) in enumerate(zip(joint.shape, shape, strict=True)) if n != wanted]
+    return joint.sum(dims, keepdim=True) if dims else joint
+
+
+def _contract(factors: list[Tensor], statics: int, previous: int) -> Tensor:
+    """Multiply factors (B, statics, previous, states) and sum over the previous states."""
+    dims = list(range(factors[0].dim()))
+    operands: list[Any] = []
+    for factor in factors:
+        kept = [d for d in dims if factor.shape[d] > 1]
+        operands += [factor.reshape([factor.shape[d] for d in kept]), kept]
+    out = [d for d in dims if not 1 + statics <= d < 1 + statics + previous]
+    sizes = [max(factor.shape[d] for factor in factors) for d in out]
+    held = {d for subscripts in operands[1::2] for d in subscripts}
+    result = torch.einsum(*operands, [d for d in out if d in held])
+    return result.reshape(sizes)
