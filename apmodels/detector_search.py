@@ -61,7 +61,7 @@ def _at(table: Tensor, offset: Tensor) -> Tensor:
 
 
 class DetectorSearch(VisualSearch):
-    """Where is the object?  A detector's boxes, counted in each cell, per fixation.  (thesis ch. 5, eqs 5.21 to 5.23)"""
+    """Where is the object?  A detector's boxes, counted in each cell, per fixation.  (thesis ch. 5, eqs 5.21-5.23)"""
 
     grid: Grid = Grid(21, 21)
     counts: CountModel = CountModel.untrained()

@@ -41,7 +41,7 @@ def rebuilt(thing: Any, visit: Callable[[Tensor], Tensor], lead: tuple[int, ...]
         new = copy.copy(thing)
         new.__dict__.update({key: rebuilt(value, visit, lead, drop) for key, value in vars(thing).items()})
         if isinstance(new, Distribution):
-            new._batch_shape = torch.Size(lead) + thing._batch_shape[drop:]
+            new._batch_shape = torch.Size(lead) + new._batch_shape[drop:]
         return new
     return thing
 
@@ -58,9 +58,7 @@ def tensors(thing: Any) -> list[Tensor]:
     return found
 
 
-def with_tensors(
-    thing: Any, parts: list[Tensor] | tuple[Tensor, ...], lead: tuple[int, ...], drop: int = 0
-) -> Any:
+def with_tensors(thing: Any, parts: list[Tensor] | tuple[Tensor, ...], lead: tuple[int, ...], drop: int = 0) -> Any:
     """Return ``thing`` around other tensors, each with ``lead`` instead of its first ``drop`` dimensions."""
     remaining = iter(parts)
     return rebuilt(thing, lambda _: next(remaining), lead, drop)

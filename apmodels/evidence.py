@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from pyro.distributions import TorchDistribution
@@ -18,8 +19,8 @@ class Evidence(TorchDistribution):
     relative to the background.
     """
 
-    arg_constraints = {}
-    support = constraints.real_vector
+    arg_constraints = {}  # type: ignore[assignment]
+    support = constraints.real_vector  # type: ignore[assignment]
     has_rsample = False
 
     def __init__(self, log_ratio: Callable[[Tensor], Tensor], validate_args: bool | None = None):
@@ -35,7 +36,7 @@ class Evidence(TorchDistribution):
         """Return the log likelihood ratio of ``value`` in nats."""
         return self.log_ratio(value)
 
-    def sample(self, sample_shape: torch.Size | tuple = ()) -> Tensor:  # type: ignore[override]
+    def sample(self, sample_shape: Any = ()) -> Tensor:
         """Refuse: nobody said how such an observation comes about."""
         raise NotImplementedError(
             "an Evidence can be scored but not drawn: it says how much likelier an observation is than under "

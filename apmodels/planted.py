@@ -21,13 +21,11 @@ class Planted(TorchDistribution):
             family as ``here``.
     """
 
-    arg_constraints = {}
-    support = constraints.real_vector
+    arg_constraints = {}  # type: ignore[assignment]
+    support = constraints.real_vector  # type: ignore[assignment]
     has_rsample = False
 
-    def __init__(
-        self, index: Tensor, here: Distribution, elsewhere: Distribution, validate_args: bool | None = None
-    ):
+    def __init__(self, index: Tensor, here: Distribution, elsewhere: Distribution, validate_args: bool | None = None):
         if type(here) is not type(elsewhere) or here.event_shape != elsewhere.event_shape:
             raise TypeError(
                 f"Planted needs one family for both laws, not {type(here).__name__} and {type(elsewhere).__name__}"

@@ -104,9 +104,7 @@ def check_actions(model: Any, actions: Values) -> Values:
     """Return actions as the spaces want them; ValueOutOfRange, by name, for one that is outside its space."""
     variables = model.declaration.variables
     name = type(model).__name__
-    return {
-        key: variables[key].space_of(model).check(value, f"{name}.{key}") for key, value in actions.items()
-    }
+    return {key: variables[key].space_of(model).check(value, f"{name}.{key}") for key, value in actions.items()}
 
 
 def simulate(

@@ -114,9 +114,7 @@ class _Reader:
 
     def structure(self) -> Structure:
         nodes = {name: self._node(variable) for name, variable in self.variables.items()}
-        return Structure(
-            type(self.model).__name__, nodes, tuple(self.arrows), self.model.declaration.interest_names
-        )
+        return Structure(type(self.model).__name__, nodes, tuple(self.arrows), self.model.declaration.interest_names)
 
     # Which variables are known, and which have finitely many values: the largest sets that hold together.
 
@@ -133,18 +131,14 @@ class _Reader:
             return True
         if self.probe.is_random(variable.name):
             return False
-        return all(
-            p.name in members or self.variables[p.name].role == "observation" for p in _with_befores(variable)
-        )
+        return all(p.name in members or self.variables[p.name].role == "observation" for p in _with_befores(variable))
 
     def _stays_finite(self, variable: Variable, members: set[str]) -> bool:
         if variable.name in self.known or variable.role == "observation":
             return variable.name in self.known
         if self.probe.is_random(variable.name):
             return support_of(self.probe.laws_of[variable.name]) is not None
-        return all(
-            p.name in members or self.variables[p.name].role == "observation" for p in _with_befores(variable)
-        )
+        return all(p.name in members or self.variables[p.name].role == "observation" for p in _with_befores(variable))
 
     def _arrows_into(self, variable: Variable) -> list[Arrow]:
         arrows: list[Arrow] = []

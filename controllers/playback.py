@@ -30,7 +30,9 @@ class Playback(Controller):
             shape = self.model.space(name).shape
             at = value.dim() - len(shape) - 1
             if belief.time >= value.shape[at]:
-                raise ValueOutOfRange(f"the record of {name} has {value.shape[at]} steps; this is step {belief.time + 1}")
+                raise ValueOutOfRange(
+                    f"the record of {name} has {value.shape[at]} steps; this is step {belief.time + 1}"
+                )
             now = value.select(at, belief.time)
             chosen[name] = now if belief.batch is None or at else now.expand(belief.batch, *shape)
         return as_given(chosen)

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from hardware.body import Body as Body
+
     # The digital eye.
     from hardware.detectors import CascadeDetector as CascadeDetector
     from hardware.detectors import Detector as Detector

@@ -101,7 +101,9 @@ class Engine(ABC):
     def _actions(self, action: Any, batch: int) -> Values:
         names = self.model.action_names
         checked = check_actions(self.model, as_dict(action, names, "action"))
-        return {name: self._batched(name, value, self.model.space(name).shape, batch) for name, value in checked.items()}
+        return {
+            name: self._batched(name, value, self.model.space(name).shape, batch) for name, value in checked.items()
+        }
 
     def _observations(self, observation: Any, batch: int) -> Values:
         names = self.model.observation_names

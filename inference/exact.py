@@ -6,12 +6,13 @@ import math
 from typing import Any
 
 import torch
-from pyro.distributions import Categorical, MixtureSameFamily
+from pyro.distributions import Categorical
+from pyro.distributions.torch import MixtureSameFamily  # type: ignore[attr-defined]
 from rich.progress import track
 from torch import Tensor
 
 from apmodels import Model, ValueOutOfRange
-from apmodels.distributions import compact, tensors, with_tensors
+from apmodels.distributions import tensors, with_tensors
 from apmodels.simulation import Values
 from apmodels.structure import Structure
 from apmodels.variables import Variable
@@ -122,7 +123,9 @@ class Exact(Engine):
             lead = law.batch_shape[1 : 1 + len(mesh.axes)]
             weights = _summed_to(joint, (count, *lead))
             flat = torch.Size(lead).numel()
-            parts = [p.expand(count, *p.shape[1:]).reshape(count, flat, *p.shape[1 + len(lead) :]) for p in tensors(law)]
+            parts = [
+                p.expand(count, *p.shape[1:]).reshape(count, flat, *p.shape[1 + len(lead) :]) for p in tensors(law)
+            ]
             components = with_tensors(law, parts, (count, flat), 1 + len(lead))
             weights = weights.reshape(count, flat)
             if belief.batch is None:
@@ -138,7 +141,9 @@ class Exact(Engine):
     def prepare(self) -> Exact:
         """Tabulate the laws for every action now, and return self."""
         spaces = [(name, self.model.space(name)) for name in self.model.action_names]
-        if any(space.size is None for _, space in spaces) or any(key[0] not in dict(spaces) for key in self.contexts.keys):
+        if any(space.size is None for _, space in spaces) or any(
+            key[0] not in dict(spaces) for key in self.contexts.keys
+        ):
             raise ValueOutOfRange(f"{type(self.model).__name__} has contexts that cannot be listed beforehand")
         if spaces:
             values = torch.cartesian_prod(*[torch.arange(space.size or 0) for _, space in spaces])
@@ -166,6 +171,7 @@ class Exact(Engine):
     # Knowing and predicting.
 
     def names(self, names: str | tuple[str, ...] | None) -> tuple[str, ...]:
+        """Return variables' names as a tuple; the interest's where none are given."""
         if names is None:
             return ("interest",) if self.model.declaration.interest else self.structure.interest
         return (names,) if isinstance(names, str) else tuple(names)
@@ -202,7 +208,7 @@ class Exact(Engine):
 
     def _before(self, mesh: Slice, axis: Axis) -> Tensor:
         if axis.name not in self.model.declaration.remembered:
-            return torch.full((), -torch.tensor(float(axis.size)).log(), dtype=self.dtype)
+            return torch.tensor(-math.log(axis.size), dtype=self.dtype)
         before = self.laws.before(axis.name)
         here = mesh.along(axis, axis.values)
         there = mesh.value(before.name) if isinstance(before, Variable) else before.to(here.dtype)
@@ -261,9 +267,7 @@ class Exact(Engine):
         """Add the tables of K new contexts, a chunk at a time."""
         count = 1 if context is None else len(next(iter(context.values())))
         axes = self.statics + self.previous + self.states
-        largest = max(
-            torch.Size(self.structure.nodes[name].shape).numel() for name in self.model.observation_names
-        )
+        largest = max(torch.Size(self.structure.nodes[name].shape).numel() for name in self.model.observation_names)
         step = max(1, CHUNK // max(1, largest * torch.Size(self.sizes).numel()))
         starts = range(0, count, step)
         for start in track(starts, "tabulating", transient=True) if len(starts) > 3 else starts:

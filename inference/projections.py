@@ -47,7 +47,11 @@ class Projections:
         if all(name in at for name in names) and [at[n] for n in names] == sorted(at[n] for n in names):
             values = [engine.axes[at[name] - 1].values for name in names]
             picked = torch.cartesian_prod(*[torch.arange(len(v)) for v in values]).reshape(-1, len(values))
-            return {n: v[picked[:, i]] for i, (n, v) in enumerate(zip(names, values, strict=True))}, [at[n] for n in names], None
+            return (
+                {n: v[picked[:, i]] for i, (n, v) in enumerate(zip(names, values, strict=True))},
+                [at[n] for n in names],
+                None,
+            )
         mesh = Slice(engine.laws, engine.axes, {})
         columns, shapes = [], []
         for name in names:

@@ -137,9 +137,7 @@ def _reach(laws: Laws, structure: Structure, fixed: dict[str, Tensor], searched:
     remembered = laws.model.declaration.remembered
     found = {name: _first(laws, name, fixed) for name in searched}
     while True:
-        axes = [
-            Axis(name, 1, values) for name, values in (fixed | found).items() if name in remembered
-        ]
+        axes = [Axis(name, 1, values) for name, values in (fixed | found).items() if name in remembered]
         axes += [Axis(name, 0, values) for name, values in fixed.items()]
         for node in structure.planned("given"):
             if node.values is None:

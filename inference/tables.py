@@ -244,7 +244,7 @@ class FiniteTable(Table):
         outcomes = y.to(torch.int64)
         low, high = torch.aminmax(outcomes)
         last = self.table.shape[-1] - 1
-        if 0 <= int(low) and int(high) <= last and bool((outcomes == y).all()):
+        if int(low) >= 0 and int(high) <= last and bool((outcomes == y).all()):
             return outcomes
         wrong = ~(torch.isnan(y) | (y >= 0) & (y <= last) & (y == y.round()))
         if bool(wrong.any()):
@@ -276,9 +276,7 @@ class FiniteTable(Table):
         assert self.index is not None
         drawn = _inverse(self.baseline[rows][:, None], uniform)
         index = self.index[rows[:, None], chosen]
-        floor = self.baseline[rows].gather(
-            1, index.flatten(1)[..., None].expand(-1, -1, self.baseline.shape[-1])
-        )
+        floor = self.baseline[rows].gather(1, index.flatten(1)[..., None].expand(-1, -1, self.baseline.shape[-1]))
         here = self.table[rows[:, None], chosen] + floor.reshape(*index.shape, -1)
         at = uniform.expand(len(rows), -1, -1).gather(2, index)
         return drawn.scatter(2, index, _inverse(here, at))

@@ -23,9 +23,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line; return its exit code."""
     parser = argparse.ArgumentParser("python -m experiments.data", description=__doc__, epilog=_AFTERWORD)
     parser.add_argument("names", nargs="*", metavar="NAME", help="an entry of the table, as --list names it")
-    parser.add_argument(
-        "--list", action="store_true", help="show the table and what has been fetched, and stop"
-    )
+    parser.add_argument("--list", action="store_true", help="show the table and what has been fetched, and stop")
     options = parser.parse_args(arguments)
     unknown = [name for name in options.names if name not in TABLE]
     if unknown:
@@ -41,9 +39,7 @@ def _fetch(names: list[str], console: Console) -> int:
         console.print("Interrupted; the next run goes on from here.")
         return 130
     except OSError as problem:
-        console.print(
-            f"The data folder {store.root()} cannot be used: {problem.strerror or problem}.", soft_wrap=True
-        )
+        console.print(f"The data folder {store.root()} cannot be used: {problem.strerror or problem}.", soft_wrap=True)
         return 1
     counts = Counter(sentence.split()[0].rstrip(",:") for sentence in results.values())
     summary = ", ".join(f"{count} {word}" for word, count in counts.items())

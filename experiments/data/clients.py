@@ -28,9 +28,7 @@ def missing(registry: str) -> str | None:
         return None if _pip() else "pip is not installed in this Python."
     needed = {"npm": ["npm"], "debian": ["apt-get", "dpkg-deb"]}[registry]
     absent = [client for client in needed if not shutil.which(client)]
-    return (
-        f"{' and '.join(absent)} {'are' if len(absent) > 1 else 'is'} not installed here." if absent else None
-    )
+    return f"{' and '.join(absent)} {'are' if len(absent) > 1 else 'is'} not installed here." if absent else None
 
 
 def download(entry: Entry, to: Path) -> Path:

@@ -40,9 +40,7 @@ def fetch(names: Iterable[str] | None = None, *, console: Console | None = None)
     A sentence starts with ``fetched``, ``present`` (nothing was downloaded), ``skipped`` (a client is not
     installed) or ``failed``.  One entry's failure does not stop the others.
     """
-    wanted = (
-        [e for e in TABLE.values() if not e.optional] if names is None else [store.find(n) for n in names]
-    )
+    wanted = [e for e in TABLE.values() if not e.optional] if names is None else [store.find(n) for n in names]
     console = console or Console(stderr=True)
     results: dict[str, str] = {}
     store.root().mkdir(parents=True, exist_ok=True)
@@ -68,9 +66,7 @@ def _fetch_one(entry: Entry, say: Say) -> str:
     except Failed as problem:
         return f"failed: {problem}"
     except OSError as problem:
-        return (
-            f"failed: {problem.filename or part} could not be read or written: {problem.strerror or problem}."
-        )
+        return f"failed: {problem.filename or part} could not be read or written: {problem.strerror or problem}."
     without = f"; not in this version: {', '.join(lost)}" if lost else ""
     return f"fetched, {_contents(entry)}{without}."
 

@@ -338,9 +338,7 @@ def test_scenes_are_those_the_table_marks(world):
 
 
 def test_what_is_not_fetched_or_not_known_is_said(world, capsys):
-    with pytest.raises(
-        FileNotFoundError, match=r"'faces' \(pypi faces 1\.0\) have not been fetched .* `make data`"
-    ):
+    with pytest.raises(FileNotFoundError, match=r"'faces' \(pypi faces 1\.0\) have not been fetched .* `make data`"):
         data.files("faces")
     with pytest.raises(ValueError, match="no data named 'nobody'; the names are faces, portraits, voices"):
         data.folder("nobody")
