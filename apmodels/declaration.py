@@ -35,6 +35,11 @@ class Declaration:
         return [variable for variable in self.variables.values() if variable.role in roles]
 
     @cached_property
+    def names(self) -> dict[str, list[str]]:
+        """Role -> the names of its variables, in order."""
+        return {role: [variable.name for variable in self.of_role(role)] for role in ROLES}
+
+    @cached_property
     def remembered(self) -> dict[str, object]:
         """The variables that some law asks for a step late, with their values before time began."""
         lagged = [parent for v in self.variables.values() for parent in v.parents if parent.lag]

@@ -1,8 +1,8 @@
 """The Bayes net of one time slice, as an SVG drawing.
 
-Columns are the step before and this one; rows go from what is drawn once, over actions and states, to what is
-observed. Grey is observed or known, white is hidden, a square is chosen, a double rim is deterministic, and the
-interest has a coloured rim.
+Time runs to the right and causes run down: at the left the step before and the actions, in the middle the states
+and the observations, at the right what is drawn once. Grey is observed or known, white is hidden, a square is
+chosen, a double rim is deterministic, and the interest has a coloured rim.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import math
 from typing import Any
 
 ROLES = ("static", "action", "state", "observation")
-ACROSS, DOWN, RADIUS = 150, 100, 30
+ACROSS, DOWN, RADIUS, ZIGZAG = 150, 100, 30, 80
 INTEREST = "#d6336c"
 COLOURS = {
     "given": "#868e96",
@@ -47,23 +47,34 @@ def draw(model: Any) -> str:
 
 
 def _places(structure: Any) -> dict[tuple[str, int], Place]:
-    """Where each variable stands: those a step ago at the left, below each other by role and order."""
+    """Where each variable stands.
+
+    At the left what was a step ago and what is chosen, in the middle the states and below them what is observed,
+    at the right what is drawn once; states stand in zigzag, so that arrows do not run through nodes.
+    """
     places: dict[tuple[str, int], Place] = {}
     lagged = {arrow.parent for arrow in structure.arrows if arrow.lag}
-    left = RADIUS + 30 + (ACROSS if lagged else 0)
-    y = RADIUS + 20.0
-    for role in ROLES:
-        names = [node.name for node in structure.nodes.values() if node.role == role]
-        column = 0
-        for name in names:
-            # A state that depends on another one stands below it, so that no arrow runs through a node.
-            if column and any(arrow.parent in names and not arrow.lag for arrow in structure.into(name)):
-                column, y = 0, y + DOWN
-            places[name, 0] = (left + column * ACROSS, y)
-            if name in lagged:
-                places[name, 1] = (RADIUS + 30.0, y)
-            column += 2 if name in lagged else 1
-        y += DOWN if names else 0
+    named = {role: [n.name for n in structure.nodes.values() if n.role == role] for role in ROLES}
+    left, top = RADIUS + 30.0, RADIUS + 20.0
+    middle = left + (ACROSS if lagged or named["action"] else 0)
+    for i, name in enumerate(named["action"]):
+        places[name, 0] = (left, top + i * DOWN)
+        if name in lagged:
+            places[name, 1] = (left + ACROSS * 0.6, top + i * DOWN)
+    y = top + DOWN * len(named["action"])
+    for i, name in enumerate(named["state"]):
+        places[name, 0] = (middle + ZIGZAG * (i % 2), y)
+        if name in lagged:
+            places[name, 1] = (left, y)
+        y += DOWN
+    y = max(y, top + DOWN * len(named["static"]) * 0.5)
+    for i, name in enumerate(named["observation"]):
+        places[name, 0] = (middle + i * ACROSS, y)
+        if name in lagged:
+            places[name, 1] = (left, y)
+    right = middle + ACROSS + (ZIGZAG if len(named["state"]) > 1 else 0)
+    for i, name in enumerate(named["static"]):
+        places[name, 0] = (right, top + i * DOWN)
     return places
 
 
@@ -81,7 +92,7 @@ def _node(structure: Any, name: str, lag: int, place: Place) -> str:
         if not node.random:
             shape += f'<circle cx="{x}" cy="{y}" r="{RADIUS - 4}" fill="none" stroke="{rim}" stroke-width="1"/>'
     label = html.escape(name)
-    size = min(12.0, 2 * (RADIUS - 4) / max(len(name), 1) * 1.75)
+    size = min(12.0, 2 * (RADIUS - 3) / max(len(name), 1) * 1.6)
     under = "a step ago" if lag else node.plan
     return (
         f"<g><title>{html.escape(f'{name}: {node.family}, {node.plan}, {node.why}')}</title>{shape}"

@@ -61,12 +61,12 @@ class Model:
     @property
     def action_names(self) -> list[str]:
         """The actions, in order."""
-        return [variable.name for variable in self.declaration.of_role("action")]
+        return self.declaration.names["action"]
 
     @property
     def observation_names(self) -> list[str]:
         """The observations, in order."""
-        return [variable.name for variable in self.declaration.of_role("observation")]
+        return self.declaration.names["observation"]
 
     def simulate(
         self,

@@ -169,7 +169,7 @@ class _Reader:
             if p not in direct:
                 argument = next(q for q in direct if isinstance(q.before, Variable) and q.before.name == p.name)
                 kind, why = kinds[argument.argument]
-                arrows.append(Arrow(p.name, 1, variable.name, kind, f"as {argument.argument}: {why}"))
+                arrows.append(Arrow(p.name, 0, variable.name, kind, f"the first {argument.argument}; {why}"))
         return arrows
 
     def _conjugate_parents(self, variable: Variable, parents: list[Parent]) -> list[Parent]:

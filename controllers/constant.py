@@ -25,4 +25,4 @@ class Constant(Controller):
     def act(self, belief: Belief) -> Any:
         """Return the action, for each belief."""
         rows = () if belief.batch is None else (belief.batch,)
-        return as_given({name: value.expand(*rows, *value.shape) for name, value in self.actions.items()})
+        return as_given({name: value.expand((*rows, *value.shape)) for name, value in self.actions.items()})

@@ -27,7 +27,18 @@ def main() -> None:
     if "=" not in words[0] and not words[0].startswith("-"):
         _run_tool(words[0], words[1:])
         return
+    sys.argv[1:] = [_quoted(word) for word in words]
     _hydra()
+
+
+def _quoted(word: str) -> str:
+    """Quote the value of key=PATH where a path exists: Hydra's grammar stumbles over brackets and the like."""
+    key, _, value = word.partition("=")
+    plain = all(c.isalnum() or c in "/._-~" for c in value)
+    if not value or plain or value[0] in "'\"" or not Path(value).exists():
+        return word
+    escaped = value.replace("\\", "\\\\").replace("'", "\\'")
+    return f"{key}='{escaped}'"
 
 
 def usage() -> str:

@@ -8,6 +8,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import torch
 import xarray as xr
 from hydra.utils import instantiate
 from rich.console import Console
@@ -55,8 +56,10 @@ class Search:
                 f"not {config.threshold} and {config.fixations}"
             )
         self.eye: PhotoEye = instantiate(config.body)(photo=photo, grid=(self.grid.rows, self.grid.columns))
-        # Tables and detectors are made once and serve any number of photographs: that is not search.
+        # Tables and detectors are made once and serve any number of photographs: that is not search. Nor is the
+        # first update, in which torch sets itself up.
         self.engine = instantiate(config.engine)(self.model).prepare()
+        self.engine.update(self.engine.start(), 0, torch.zeros(self.grid.size)).most_probable()
         self.controller = instantiate(config.controller)(self.engine)
         self.box: np.ndarray | None = None
         self.closer = 0.0

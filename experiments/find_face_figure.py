@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import MaxNLocator
 
 FACE = "#00d0ff"
 RIVAL = "#ffb000"
@@ -29,6 +30,8 @@ def draw(search: Any) -> Figure:
     for axes, title in ((left, "fixations"), (middle, "belief"), (right, "what the last look saw")):
         axes.set_title(title)
         axes.set_xlabel("column (cells)")
+        axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+        axes.yaxis.set_major_locator(MaxNLocator(6, integer=True))
     left.set_ylabel("row (cells)")
     left.imshow(_small(search.photo), extent=extent, aspect=ratio)
     _gaze(left, search)

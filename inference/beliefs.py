@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from pyro.distributions import Categorical
 from torch import Tensor
+from torch.distributions import Distribution
 
 
 class Marginal(Categorical):
@@ -18,8 +19,11 @@ class Marginal(Categorical):
     """
 
     def __init__(self, log_probs: Tensor, values: Tensor):
-        super().__init__(logits=log_probs, validate_args=False)
+        # Already normalised, which Categorical's own constructor would do again, at the cost of an update.
+        self.logits = self._param = log_probs
+        self._num_events = log_probs.shape[-1]
         self.values = values
+        Distribution.__init__(self, log_probs.shape[:-1], validate_args=False)
 
     @property
     def mean(self) -> Tensor:

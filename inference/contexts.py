@@ -20,9 +20,14 @@ class Contexts:
         self.keys = keys
         self.build = build
         self.forget = forget
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all contexts and their tables."""
         self.seen: dict[tuple, int] = {}
         self.singles: dict[int, Tensor] = {}
         self.lookup = torch.full((0,), -1, dtype=torch.int64)
+        self.forget()
 
     def rows(self, context: Context) -> Tensor:
         """Return the row of each of B contexts, int64 (B,)."""
@@ -66,8 +71,7 @@ class Contexts:
         first = torch.zeros(len(table), dtype=torch.int64).scatter(0, inverse, torch.arange(len(inverse)))
         keys = [tuple(row) for row in table.tolist()]
         if len(self.seen) + len(keys) > MOST:
-            self.seen.clear()
-            self.forget()
+            self.clear()
         new = [i for i, key in enumerate(keys) if key not in self.seen]
         if new:
             self.build({key: context[key][first[new]] for key in self.keys})

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from apmodels import Model, ValueOutOfRange
 from apmodels.laws import Laws
-from apmodels.simulation import Values, as_dict, check_actions
+from apmodels.simulation import Values, as_dict
 from apmodels.structure import Structure
 from inference.beliefs import Belief
 
@@ -47,6 +47,8 @@ class Engine(ABC):
             raise Refusal(f"{type(self).__name__} cannot serve {type(model).__name__}: {bid.reason}")
         self.laws = Laws(model, dtype)
         self.dtype = self.laws.dtype
+        self.spaces = {name: model.space(name) for name in model.action_names}
+        self.shown = {name: self.structure.nodes[name].shape for name in model.observation_names}
 
     @classmethod
     @abstractmethod
@@ -99,24 +101,25 @@ class Engine(ABC):
     # What users pass, checked and with a batch dimension.
 
     def _actions(self, action: Any, batch: int) -> Values:
-        names = self.model.action_names
-        checked = check_actions(self.model, as_dict(action, names, "action"))
-        return {
-            name: self._batched(name, value, self.model.space(name).shape, batch) for name, value in checked.items()
-        }
+        given = as_dict(action, self.model.action_names, "action")
+        checked = {}
+        for name, value in given.items():
+            space = self.spaces[name]
+            value = space.check(value, f"{type(self.model).__name__}.{name}")
+            checked[name] = self._batched(name, value, space.shape, batch)
+        return checked
 
     def _observations(self, observation: Any, batch: int) -> Values:
-        names = self.model.observation_names
         seen = {}
-        for name, value in as_dict(observation, names, "observation").items():
-            shape = self.structure.nodes[name].shape
+        for name, value in as_dict(observation, self.model.observation_names, "observation").items():
             value = value if value.dtype == self.dtype else value.to(self.dtype)
-            seen[name] = self._batched(name, value, shape, batch).reshape(batch, -1)
+            value = self._batched(name, value, self.shown[name], batch)
+            seen[name] = value if value.dim() == 2 else value.reshape(batch, -1)
         return seen
 
     def _batched(self, name: str, value: Tensor, shape: tuple[int, ...], batch: int) -> Tensor:
         if tuple(value.shape) == shape:
-            return value.expand(batch, *shape)
+            return value.unsqueeze(0) if batch == 1 else value.expand(batch, *shape)
         if tuple(value.shape) == (batch, *shape):
             return value
         where = f"{type(self.model).__name__}.{name}"

@@ -22,7 +22,7 @@ from inference.engine import Bid, Engine
 from inference.imagining import information_gain
 from inference.projections import Projections
 from inference.slices import Axis, Context, Key, Slice, supports
-from inference.tables import Table, tabulate
+from inference.tables import Misfit, Rows, Table, tabulate
 
 # How many numbers of a law's table are evaluated at a time.
 CHUNK = 40_000_000
@@ -48,8 +48,9 @@ class Exact(Engine):
         self.sizes = tuple(axis.size for axis in self.axes)
         self.remembered = [n for n in remembered if n not in values]
         self.projections = Projections(self)
-        self.contexts = Contexts(self._context_keys(), self._tabulate, self._forget)
-        self._forget()
+        self.keys = self._context_keys()
+        self.generic = False
+        self.contexts = Contexts(self.keys, self._tabulate, self._forget)
 
     @classmethod
     def bid(cls, structure: Structure) -> Bid:
@@ -86,26 +87,27 @@ class Exact(Engine):
         actions = self._actions(action, count)
         seen = self._observations(observation, count)
         known, context = self.know(belief, actions)
-        rows = self.contexts.rows(context)
-        rows = rows if len(rows) == count else rows.expand(count)
+        rows = self._rows(context, count)
         evidence: Tensor | float = 0.0
         early: list[Tensor] = []
         late: list[Tensor] = []
         for name, table in self.tables.items():
             y = table.read(seen[name], f"{type(self.model).__name__}.{name}")
-            ratio = table.ratio(rows, y).reshape(count, *self.shapes[name])
+            ratio = table.ratio(rows, y)
             evidence = evidence + table.base(rows, y)
             if self.is_late(name):
-                late.append(self._now(ratio))
+                late.append(ratio.reshape(count, *self.now_shapes[name]))
             else:
-                early.append(ratio)
+                early.append(ratio.reshape(count, *self.shapes[name]))
         log_probs, shift = self.predict(belief.log_probs, rows, early)
-        log_probs = sum(late, start=log_probs)
-        total = log_probs.flatten(1).logsumexp(1)
-        if not math.isfinite(float(total.sum())):
+        weights = sum(late, start=log_probs).flatten(1)
+        log_probs = weights.log_softmax(1)
+        # Normalising lowers every log weight by the log of their sum, the largest too.
+        total = weights.amax(1) - log_probs.amax(1)
+        if not math.isfinite(float(total if count == 1 else total.sum())):
             raise ValueOutOfRange(f"{type(self.model).__name__} gives what was observed no probability at all")
-        log_probs = log_probs - total.reshape(-1, *[1] * len(self.sizes))
-        evidence = evidence + shift + total
+        log_probs = log_probs.reshape(count, *self.sizes)
+        evidence = total + evidence if shift is None else total + evidence + shift
         evidence = belief.log_evidence + (evidence[0] if belief.batch is None else evidence)
         kept = self._kept(known | actions, seen) if self.remembered else {}
         return FiniteBelief(self, belief.batch, belief.time + 1, evidence, kept, log_probs)
@@ -114,7 +116,7 @@ class Exact(Engine):
         """Return the predictive distribution of the next observation, a mixture over the hidden values."""
         count = len(belief.log_probs)
         _, context = self.know(belief, self._actions(action, count))
-        rows = self.contexts.rows(context).expand(count)
+        rows = self._rows(context, count)
         mesh = Slice(self.laws, self.statics + self.previous + self.states, context)
         joint = self.joint(belief.log_probs, rows)
         made = {}
@@ -141,14 +143,12 @@ class Exact(Engine):
     def prepare(self) -> Exact:
         """Tabulate the laws for every action now, and return self."""
         spaces = [(name, self.model.space(name)) for name in self.model.action_names]
-        if any(space.size is None for _, space in spaces) or any(
-            key[0] not in dict(spaces) for key in self.contexts.keys
-        ):
+        if any(space.size is None for _, space in spaces) or any(key[0] not in dict(spaces) for key in self.keys):
             raise ValueOutOfRange(f"{type(self.model).__name__} has contexts that cannot be listed beforehand")
         if spaces:
             values = torch.cartesian_prod(*[torch.arange(space.size or 0) for _, space in spaces])
             values = values.reshape(-1, len(spaces))
-            self.contexts.rows({(name, 0): s.values()[values[:, i]] for i, (name, s) in enumerate(spaces)})
+            self.find({(name, 0): s.values()[values[:, i]] for i, (name, s) in enumerate(spaces)})
         return self
 
     def marginal(self, belief: FiniteBelief, name: str) -> Marginal:
@@ -218,26 +218,40 @@ class Exact(Engine):
 
     def is_late(self, name: str) -> bool:
         """Whether an observation depends on the present alone, and not on how it came about."""
-        first = len(self.statics)
-        return all(n == 1 for n in self.shapes[name][first : first + len(self.previous)])
+        past = len(self.previous)
+        return past == 0 or all(n == 1 for n in self.shapes[name][len(self.statics) : len(self.statics) + past])
 
-    def _now(self, ratio: Tensor) -> Tensor:
-        """Drop the (single) dimensions of the past."""
-        first = 1 + len(self.statics)
-        last = first + len(self.previous)
-        return ratio.reshape(ratio.shape[:first] + ratio.shape[last:])
+    def _now(self, shape: tuple[int, ...]) -> tuple[int, ...]:
+        return shape[: len(self.statics)] + shape[len(self.statics) + len(self.previous) :]
 
-    def predict(self, log_probs: Tensor, rows: Tensor, early: list[Tensor]) -> tuple[Tensor, Tensor | float]:
+    def _rows(self, context: Context, count: int) -> Rows:
+        """Rows of the tables; a view for a single belief, which copies nothing and wakes no threads."""
+        rows = self.find(context)
+        if count == 1:
+            return slice(int(rows), int(rows) + 1)
+        return rows.expand(count)
+
+    def find(self, context: Context) -> Tensor:
+        """Return the rows of the tables for contexts, (B,) or (1,) where all are alike."""
+        try:
+            return self.contexts.rows(context)
+        except Misfit:
+            # Some later context has another structure than the first: begin again, with what serves them all.
+            self.generic = True
+            self.contexts.clear()
+            return self.contexts.rows(context)
+
+    def predict(self, log_probs: Tensor, rows: Rows, early: list[Tensor]) -> tuple[Tensor, Tensor | None]:
         """Return log p(statics, states now, early observations), up to a factor exp(shift), and shift (B,)."""
         if not self.states:
-            return log_probs, 0.0
-        shift: Tensor | float = 0.0
+            return log_probs, None
+        shift = torch.zeros(len(log_probs), dtype=self.dtype)
         factors = [self._past(log_probs).exp()]
         for ratio in early:
             most = ratio.flatten(1).amax(1)
             factors.append((ratio - most.reshape(-1, *[1] * (ratio.dim() - 1))).exp())
             shift = shift + most
-        factors += [factor[rows] if len(factor) > 1 else factor for factor in self.transitions]
+        factors += self._transitions(rows)
         result = _contract(factors, len(self.statics), len(self.previous))
         return result.log(), shift
 
@@ -249,18 +263,35 @@ class Exact(Engine):
         past = log_probs.logsumexp(gone) if gone else log_probs
         return past.reshape(*past.shape, *[1] * len(self.states))
 
-    def joint(self, log_probs: Tensor, rows: Tensor) -> Tensor:
+    def joint(self, log_probs: Tensor, rows: Rows) -> Tensor:
         """p(statics, states before, states now), (B, statics, previous, states)."""
         joint = self._past(log_probs).exp()
-        for factor in self.transitions:
-            joint = joint * (factor[rows] if len(factor) > 1 else factor)
+        for factor in self._transitions(rows):
+            joint = joint * factor
         return joint
+
+    def _transitions(self, rows: Rows) -> list[Tensor]:
+        pairs = zip(self.states, self.transitions, strict=True)
+        return [factor[rows] if self._varies(axis.name) else factor for axis, factor in pairs]
+
+    def _varies(self, name: str) -> bool:
+        """Whether a law differs between contexts, by itself or by way of deterministic variables."""
+        keyed = set(self.keys)
+        own = {axis.name for axis in self.axes}
+        for parent in self.laws.variables[name].parents:
+            if (parent.name, parent.lag) in keyed:
+                return True
+            if parent.lag == 0 and parent.name not in own and self._varies(parent.name):
+                return True
+        return False
 
     # Tabulating.
 
     def _forget(self) -> None:
         self.tables: dict[str, Table] = {}
+        # The sizes of an observation's hypotheses: of statics, states before, states now; and without the past.
         self.shapes: dict[str, tuple[int, ...]] = {}
+        self.now_shapes: dict[str, tuple[int, ...]] = {}
         self.transitions: list[Tensor] = []
 
     def _tabulate(self, context: Context | None) -> None:
@@ -277,22 +308,25 @@ class Exact(Engine):
     def _append(self, mesh: Slice) -> None:
         first = not self.tables
         transitions = [mesh.transition(axis).exp() for axis in self.states]
-        if first:
-            self.transitions = transitions
-        else:
-            pairs = zip(self.transitions, transitions, strict=True)
-            self.transitions = [old if len(new) == 1 else torch.cat([old, new]) for old, new in pairs]
+        for i, (axis, new) in enumerate(zip(self.states, transitions, strict=True)):
+            wide = new.expand(mesh.contexts, *new.shape[1:])
+            if first:
+                self.transitions.append(wide if self._varies(axis.name) else new)
+            elif self._varies(axis.name):
+                self.transitions[i] = torch.cat([self.transitions[i], wide])
         for name in self.model.observation_names:
             law = mesh.law(name)
             shape = tuple(law.batch_shape[1 : 1 + len(mesh.axes)])
             flat, contexts = torch.Size(shape).numel(), mesh.contexts
             parts = [p.expand(contexts, *p.shape[1:]) for p in tensors(law)]
             parts = [p.reshape(contexts, flat, *p.shape[1 + len(shape) :]) for p in parts]
-            table = tabulate(with_tensors(law, parts, (contexts, flat), 1 + len(shape)), contexts, flat)
+            table = tabulate(with_tensors(law, parts, (contexts, flat), 1 + len(shape)), contexts, flat, self.generic)
             if first:
                 self.tables[name], self.shapes[name] = table, shape
+                self.now_shapes[name] = self._now(shape)
             else:
                 self.tables[name].append(table)
+            self.tables[name].settle()
 
 
 def _single(belief: FiniteBelief, value: Tensor) -> Tensor:

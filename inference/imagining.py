@@ -53,7 +53,7 @@ class _Imagination:
         part = replace(belief, batch=len(rows), log_probs=belief.log_probs[rows], known=known)
         _, context = engine.know(part, actions)
         self.engine = engine
-        self.rows = engine.contexts.rows(context).expand(len(rows))
+        self.rows = engine.find(context).expand(len(rows))
         self.past = range(1 + len(engine.statics), 1 + len(engine.statics) + len(engine.previous))
         if all(engine.is_late(name) for name in engine.tables):
             logs, _ = engine.predict(part.log_probs, self.rows, [])

@@ -26,6 +26,14 @@ SPARSE = 0.25
 FEW_OUTCOMES = 1024
 
 
+# Which contexts a batch is in: (B,), or a slice of one.
+Rows = Tensor | slice
+
+
+class Misfit(Exception):
+    """A later context needs another kind of table than the first ones did."""
+
+
 class Table:
     """K contexts × H hypotheses of one observation. Subclasses are families."""
 
@@ -33,11 +41,21 @@ class Table:
     stacked: tuple[str, ...] = ()
     event_shape: torch.Size
     hypotheses: int
+    # Sparse tables as ``ratio`` reads them; see ``settle``.
+    flat_index: Tensor
+    flat_table: Tensor
+    flat_slope: Tensor
+    flat_middle: Tensor
 
     def append(self, other: Table) -> None:
-        """Add the contexts of another table of the same observation."""
+        """Add the contexts of another table of the same observation; Misfit if they are not of one kind."""
+        if type(self) is not type(other) or self.stacked != other.stacked:
+            raise Misfit
         for name in self.stacked:
-            setattr(self, name, torch.cat([getattr(self, name), getattr(other, name)]))
+            old, new = getattr(self, name), getattr(other, name)
+            if old.shape[1:] != new.shape[1:]:
+                raise Misfit
+            setattr(self, name, torch.cat([old, new]))
 
     def read(self, y: Tensor, name: str) -> Tensor:
         """Return y (B, elements) as the other methods want it; ValueOutOfRange where it cannot have been seen.
@@ -49,11 +67,11 @@ class Table:
             raise ValueOutOfRange(f"{name} is infinite in some element; observe a number, or NaN where it is missing")
         return y
 
-    def ratio(self, rows: Tensor, y: Tensor) -> Tensor:
+    def ratio(self, rows: Rows, y: Tensor) -> Tensor:
         """Return log p(y | h) - log p(y | baseline), (B, H), for y (B, elements) in contexts rows (B,)."""
         raise NotImplementedError
 
-    def base(self, rows: Tensor, y: Tensor) -> Tensor | float:
+    def base(self, rows: Rows, y: Tensor) -> Tensor | float:
         """Return log p(y | baseline), (B,)."""
         return 0.0
 
@@ -66,11 +84,20 @@ class Table:
         """All values of the whole observation (outcomes, elements), where they are few."""
         return None
 
+    def settle(self) -> None:
+        """Lay out sparse tables with hypotheses and their elements in one dimension, as ``ratio`` reads them."""
+        if getattr(self, "index", None) is not None:
+            for name in ("index", "slope", "middle", "table"):
+                if hasattr(self, name):
+                    setattr(self, f"flat_{name}", getattr(self, name).flatten(1, 2))
 
-def tabulate(law: Any, contexts: int, hypotheses: int) -> Table:
-    """Make the table of a law whose batch shape is (contexts, hypotheses)."""
+
+def tabulate(law: Any, contexts: int, hypotheses: int, generic: bool = False) -> Table:
+    """Make the table of a law whose batch shape is (contexts, hypotheses); ``generic`` serves every family alike."""
     base, added = base_of(law)
-    if isinstance(base, Planted):
+    if generic:
+        parts = None
+    elif isinstance(base, Planted):
         parts = _planted(base)
     elif len(base.event_shape) == 0:
         parts = _elementwise(base, added, contexts, hypotheses)
@@ -169,7 +196,7 @@ class GaussianTable(Table):
         slope = (location - at_location) / (scale * scale)
         return cls(index, slope, (location + at_location) / 2, base_location, base_scale)
 
-    def ratio(self, rows: Tensor, y: Tensor) -> Tensor:
+    def ratio(self, rows: Rows, y: Tensor) -> Tensor:
         """Return log p(y | h) - log p(y | baseline), (B, H)."""
         if self.index is None:
             # Centred on the baseline, so that nothing large cancels.
@@ -179,11 +206,11 @@ class GaussianTable(Table):
             here = (~missing).to(y.dtype)
             linear = torch.einsum("be,bhe->bh", torch.where(missing, 0.0, residual), slope)
             return linear - torch.einsum("be,bhe->bh", here, slope * offset)
-        index = self.index[rows]
-        at = y.gather(1, index.flatten(1)).reshape(index.shape)
-        return ((at - self.middle[rows]) * self.slope[rows]).nan_to_num(0.0).sum(-1)
+        at = y.gather(1, self.flat_index[rows])
+        scores = (at - self.flat_middle[rows]) * self.flat_slope[rows]
+        return _summed(scores.nan_to_num(0.0), self.hypotheses)
 
-    def base(self, rows: Tensor, y: Tensor) -> Tensor:
+    def base(self, rows: Rows, y: Tensor) -> Tensor:
         """Return log p(y | baseline), (B,)."""
         scale = self.scale[rows]
         standardised = (y - self.location[rows]) / scale
@@ -229,22 +256,18 @@ class FiniteTable(Table):
         at = floor.gather(1, index.flatten(1)[..., None].expand(-1, -1, floor.shape[-1])).reshape(table.shape)
         return cls(index, table - at, floor, categorical)
 
-    def ratio(self, rows: Tensor, y: Tensor) -> Tensor:
+    def ratio(self, rows: Rows, y: Tensor) -> Tensor:
         """Return log p(y | h) - log p(y | baseline), (B, H)."""
-        table = self.table[rows]
         if self.index is None:
-            at = y[:, None].expand(table.shape[:-1])
-        else:
-            index = self.index[rows]
-            at = y.gather(1, index.flatten(1)).reshape(index.shape)
-        return _outcome(table, at).sum(-1)
+            table = self.table[rows]
+            return _outcome(table, y[:, None].expand(table.shape[:-1])).sum(-1)
+        return _summed(_outcome(self.flat_table[rows], y.gather(1, self.flat_index[rows])), self.hypotheses)
 
     def read(self, y: Tensor, name: str) -> Tensor:
         """Return outcomes (B, elements) as int64, or as they are if some are missing."""
-        outcomes = y.to(torch.int64)
-        low, high = torch.aminmax(outcomes)
         last = self.table.shape[-1] - 1
-        if int(low) >= 0 and int(high) <= last and bool((outcomes == y).all()):
+        outcomes = y.to(torch.int64).clamp_(0, last)
+        if torch.equal(outcomes.to(y.dtype), y):
             return outcomes
         wrong = ~(torch.isnan(y) | (y >= 0) & (y <= last) & (y == y.round()))
         if bool(wrong.any()):
@@ -261,7 +284,7 @@ class FiniteTable(Table):
         values = torch.arange(count)
         return torch.cartesian_prod(*[values] * elements).reshape(-1, elements)
 
-    def base(self, rows: Tensor, y: Tensor) -> Tensor | float:
+    def base(self, rows: Rows, y: Tensor) -> Tensor | float:
         """Return log p(y | baseline), (B,)."""
         if self.baseline is None:
             return 0.0
@@ -294,15 +317,15 @@ class GenericTable(Table):
         parts = [torch.cat(pair) for pair in zip(tensors(self.law), tensors(other.law), strict=True)]
         self.law = with_tensors(self.law, parts, parts[0].shape[:2], 2)
 
-    def ratio(self, rows: Tensor, y: Tensor) -> Tensor:
+    def ratio(self, rows: Rows, y: Tensor) -> Tensor:
         """Return log p(y | h), (B, H)."""
-        base, _ = base_of(picked(self.law, rows, (len(rows), self.hypotheses), 2))
-        y = y.reshape(len(rows), 1, *self.event_shape)
+        base, _ = base_of(picked(self.law, rows, (len(y), self.hypotheses), 2))
+        y = y.reshape(len(y), 1, *self.event_shape)
         missing = torch.isnan(y) if y.is_floating_point() else torch.zeros_like(y, dtype=torch.bool)
         if not len(base.event_shape):
             scores = torch.where(missing, 0.0, base.log_prob(torch.where(missing, 1.0, y).to(y.dtype)))
             return scores.reshape(*scores.shape[:2], -1).sum(-1)
-        gone = missing.reshape(len(rows), -1)
+        gone = missing.reshape(len(y), -1)
         if not bool((gone.all(-1) == gone.any(-1)).all()):
             raise ValueOutOfRange(f"elements of a {type(base).__name__} cannot be missing one by one")
         scores = base.log_prob(torch.where(missing, 0.0, y).to(y.dtype))
@@ -316,6 +339,13 @@ class GenericTable(Table):
             with seeded(seed):
                 drawn.append(law.sample().reshape(len(hypotheses), -1))
         return torch.stack(drawn)
+
+
+def _summed(scores: Tensor, hypotheses: int) -> Tensor:
+    """Scores (B, H * n) summed to (B, H)."""
+    if scores.shape[1] == hypotheses:
+        return scores
+    return scores.reshape(len(scores), hypotheses, -1).sum(-1)
 
 
 def _at(values: Tensor, index: Tensor) -> Tensor:
