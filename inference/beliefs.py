@@ -20,7 +20,7 @@ class Marginal(Categorical):
 
     def __init__(self, log_probs: Tensor, values: Tensor):
         # Already normalised, which Categorical's own constructor would do again, at the cost of an update.
-        self.logits = self._param = log_probs
+        self.logits = self._param = log_probs  # type: ignore[assignment]
         self._num_events = log_probs.shape[-1]
         self.values = values
         Distribution.__init__(self, log_probs.shape[:-1], validate_args=False)

@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from pyro.distributions import Categorical
 from pyro.distributions.torch import MixtureSameFamily  # type: ignore[attr-defined]
-from rich.progress import track
 from torch import Tensor
 
 from apmodels import Model, ValueOutOfRange
@@ -17,15 +16,13 @@ from apmodels.simulation import Values
 from apmodels.structure import Structure
 from apmodels.variables import Variable
 from inference.beliefs import FiniteBelief, Marginal
-from inference.contexts import Contexts
 from inference.engine import Bid, Engine
 from inference.imagining import information_gain
+from inference.layout import Layout
 from inference.projections import Projections
-from inference.slices import Axis, Context, Key, Slice, supports
-from inference.tables import Misfit, Rows, Table, tabulate
-
-# How many numbers of a law's table are evaluated at a time.
-CHUNK = 40_000_000
+from inference.slices import Axis, Context, Slice
+from inference.table import Rows
+from inference.tabulation import Tabulation
 
 
 class Exact(Engine):
@@ -38,19 +35,9 @@ class Exact(Engine):
 
     def __init__(self, model: Model, dtype: torch.dtype | None = None):
         super().__init__(model, dtype)
-        values = supports(self.laws, self.structure)
-        hidden = [node for node in self.structure.nodes.values() if node.name in values]
-        self.statics = [Axis(n.name, 0, values[n.name]) for n in hidden if n.role == "static"]
-        self.states = [Axis(n.name, 0, values[n.name]) for n in hidden if n.role == "state"]
-        remembered = self.model.declaration.remembered
-        self.previous = [Axis(axis.name, 1, axis.values) for axis in self.states if axis.name in remembered]
-        self.axes = self.statics + self.states
-        self.sizes = tuple(axis.size for axis in self.axes)
-        self.remembered = [n for n in remembered if n not in values]
-        self.projections = Projections(self)
-        self.keys = self._context_keys()
-        self.generic = False
-        self.contexts = Contexts(self.keys, self._tabulate, self._forget)
+        self.layout = Layout(self.laws, self.structure)
+        self.tabulation = Tabulation(self.laws, self.layout)
+        self.projections = Projections(self.laws, self.structure, self.layout)
 
     @classmethod
     def bid(cls, structure: Structure) -> Bid:
@@ -70,14 +57,14 @@ class Exact(Engine):
     def start(self, batch: int | None = None) -> FiniteBelief:
         """Return the prior: statics by their laws, states at their values before time began."""
         rows = 1 if batch is None else batch
-        mesh = Slice(self.laws, self.axes, {})
-        log_probs = torch.zeros((1,) * (1 + len(self.axes)), dtype=self.dtype)
-        for axis in self.statics:
+        mesh = Slice(self.laws, self.layout.axes, {})
+        log_probs = torch.zeros((1,) * (1 + len(self.layout.axes)), dtype=self.dtype)
+        for axis in self.layout.statics:
             log_probs = log_probs + mesh.transition(axis)
-        for axis in self.states:
+        for axis in self.layout.states:
             log_probs = log_probs + self._before(mesh, axis)
-        log_probs = log_probs.expand(rows, *self.sizes).contiguous()
-        known = {name: _rows(self.laws.before(name), rows) for name in self.remembered}
+        log_probs = log_probs.expand(rows, *self.layout.sizes).contiguous()
+        known = {name: _rows(self.laws.before(name), rows) for name in self.layout.kept}
         evidence = torch.zeros(() if batch is None else rows, dtype=self.dtype)
         return FiniteBelief(self, batch, 0, evidence, known, log_probs)
 
@@ -87,18 +74,18 @@ class Exact(Engine):
         actions = self._actions(action, count)
         seen = self._observations(observation, count)
         known, context = self.know(belief, actions)
-        rows = self._rows(context, count)
+        rows = self.tabulation.rows(context, count)
         evidence: Tensor | float = 0.0
         early: list[Tensor] = []
         late: list[Tensor] = []
-        for name, table in self.tables.items():
+        for name, table in self.tabulation.tables.items():
             y = table.read(seen[name], f"{type(self.model).__name__}.{name}")
             ratio = table.ratio(rows, y)
             evidence = evidence + table.base(rows, y)
-            if self.is_late(name):
-                late.append(ratio.reshape(count, *self.now_shapes[name]))
+            if self.tabulation.is_late(name):
+                late.append(ratio.reshape(count, *self.tabulation.now_shapes[name]))
             else:
-                early.append(ratio.reshape(count, *self.shapes[name]))
+                early.append(ratio.reshape(count, *self.tabulation.shapes[name]))
         log_probs, shift = self.predict(belief.log_probs, rows, early)
         weights = sum(late, start=log_probs).flatten(1)
         log_probs = weights.log_softmax(1)
@@ -106,21 +93,21 @@ class Exact(Engine):
         total = weights.amax(1) - log_probs.amax(1)
         if not math.isfinite(float(total if count == 1 else total.sum())):
             raise ValueOutOfRange(f"{type(self.model).__name__} gives what was observed no probability at all")
-        log_probs = log_probs.reshape(count, *self.sizes)
+        log_probs = log_probs.reshape(count, *self.layout.sizes)
         evidence = total + evidence if shift is None else total + evidence + shift
         evidence = belief.log_evidence + (evidence[0] if belief.batch is None else evidence)
-        kept = self._kept(known | actions, seen) if self.remembered else {}
+        kept = self._kept(known | actions, seen) if self.layout.kept else {}
         return FiniteBelief(self, belief.batch, belief.time + 1, evidence, kept, log_probs)
 
     def forecast(self, belief: FiniteBelief, action: Any) -> Any:
         """Return the predictive distribution of the next observation, a mixture over the hidden values."""
         count = len(belief.log_probs)
         _, context = self.know(belief, self._actions(action, count))
-        rows = self._rows(context, count)
-        mesh = Slice(self.laws, self.statics + self.previous + self.states, context)
+        rows = self.tabulation.rows(context, count)
+        mesh = Slice(self.laws, self.layout.step_axes, context)
         joint = self.joint(belief.log_probs, rows)
         made = {}
-        for name in self.tables:
+        for name in self.tabulation.tables:
             law = mesh.law(name)
             lead = law.batch_shape[1 : 1 + len(mesh.axes)]
             weights = _summed_to(joint, (count, *lead))
@@ -143,12 +130,13 @@ class Exact(Engine):
     def prepare(self) -> Exact:
         """Tabulate the laws for every action now, and return self."""
         spaces = [(name, self.model.space(name)) for name in self.model.action_names]
-        if any(space.size is None for _, space in spaces) or any(key[0] not in dict(spaces) for key in self.keys):
+        others = [name for name, _ in self.layout.keys if name not in dict(spaces)]
+        if others or any(space.size is None for _, space in spaces):
             raise ValueOutOfRange(f"{type(self.model).__name__} has contexts that cannot be listed beforehand")
         if spaces:
             values = torch.cartesian_prod(*[torch.arange(space.size or 0) for _, space in spaces])
             values = values.reshape(-1, len(spaces))
-            self.find({(name, 0): s.values()[values[:, i]] for i, (name, s) in enumerate(spaces)})
+            self.tabulation.find({(name, 0): s.values()[values[:, i]] for i, (name, s) in enumerate(spaces)})
         return self
 
     def marginal(self, belief: FiniteBelief, name: str) -> Marginal:
@@ -176,18 +164,6 @@ class Exact(Engine):
             return ("interest",) if self.model.declaration.interest else self.structure.interest
         return (names,) if isinstance(names, str) else tuple(names)
 
-    def _context_keys(self) -> list[Key]:
-        """What is known and bears, perhaps by way of hidden deterministic variables, on what is hidden or seen."""
-        known = {n.name for n in self.structure.planned("given", "known", "observed")}
-        keys: dict[Key, None] = {}
-        for variable in self.model.declaration.variables.values():
-            if variable.role == "action" or self.structure.nodes[variable.name].plan == "known":
-                continue
-            for parent in variable.parents:
-                if parent.name in known:
-                    keys[parent.name, parent.lag] = None
-        return list(keys)
-
     def know(self, belief: FiniteBelief, actions: Values) -> tuple[Values, Context]:
         """Move the known states on; return them and everything known by (name, lag)."""
         context: Context = {(name, 1): value for name, value in belief.known.items()}
@@ -204,7 +180,7 @@ class Exact(Engine):
     def _kept(self, known: Values, seen: Values) -> Values:
         """What later steps ask for."""
         now = {name: y.reshape(len(y), *self.structure.nodes[name].shape) for name, y in seen.items()}
-        return {name: (known | now)[name] for name in self.remembered}
+        return {name: (known | now)[name] for name in self.layout.kept}
 
     def _before(self, mesh: Slice, axis: Axis) -> Tensor:
         if axis.name not in self.model.declaration.remembered:
@@ -216,34 +192,9 @@ class Exact(Engine):
         same = same.flatten(1 + len(mesh.axes)).all(-1) if same.dim() > 1 + len(mesh.axes) else same
         return same.to(self.dtype).log()
 
-    def is_late(self, name: str) -> bool:
-        """Whether an observation depends on the present alone, and not on how it came about."""
-        past = len(self.previous)
-        return past == 0 or all(n == 1 for n in self.shapes[name][len(self.statics) : len(self.statics) + past])
-
-    def _now(self, shape: tuple[int, ...]) -> tuple[int, ...]:
-        return shape[: len(self.statics)] + shape[len(self.statics) + len(self.previous) :]
-
-    def _rows(self, context: Context, count: int) -> Rows:
-        """Rows of the tables; a view for a single belief, which copies nothing and wakes no threads."""
-        rows = self.find(context)
-        if count == 1:
-            return slice(int(rows), int(rows) + 1)
-        return rows.expand(count)
-
-    def find(self, context: Context) -> Tensor:
-        """Return the rows of the tables for contexts, (B,) or (1,) where all are alike."""
-        try:
-            return self.contexts.rows(context)
-        except Misfit:
-            # Some later context has another structure than the first: begin again, with what serves them all.
-            self.generic = True
-            self.contexts.clear()
-            return self.contexts.rows(context)
-
     def predict(self, log_probs: Tensor, rows: Rows, early: list[Tensor]) -> tuple[Tensor, Tensor | None]:
         """Return log p(statics, states now, early observations), up to a factor exp(shift), and shift (B,)."""
-        if not self.states:
+        if not self.layout.states:
             return log_probs, None
         shift = torch.zeros(len(log_probs), dtype=self.dtype)
         factors = [self._past(log_probs).exp()]
@@ -251,82 +202,24 @@ class Exact(Engine):
             most = ratio.flatten(1).amax(1)
             factors.append((ratio - most.reshape(-1, *[1] * (ratio.dim() - 1))).exp())
             shift = shift + most
-        factors += self._transitions(rows)
-        result = _contract(factors, len(self.statics), len(self.previous))
+        factors += self.tabulation.transitions(rows)
+        result = _contract(factors, len(self.layout.statics), len(self.layout.previous))
         return result.log(), shift
 
     def _past(self, log_probs: Tensor) -> Tensor:
         """The belief with dimensions (B, statics, previous, 1 for each state now)."""
-        kept = {axis.name for axis in self.previous}
-        first = 1 + len(self.statics)
-        gone = [first + i for i, axis in enumerate(self.states) if axis.name not in kept]
+        kept = {axis.name for axis in self.layout.previous}
+        first = 1 + len(self.layout.statics)
+        gone = [first + i for i, axis in enumerate(self.layout.states) if axis.name not in kept]
         past = log_probs.logsumexp(gone) if gone else log_probs
-        return past.reshape(*past.shape, *[1] * len(self.states))
+        return past.reshape(*past.shape, *[1] * len(self.layout.states))
 
     def joint(self, log_probs: Tensor, rows: Rows) -> Tensor:
         """p(statics, states before, states now), (B, statics, previous, states)."""
         joint = self._past(log_probs).exp()
-        for factor in self._transitions(rows):
+        for factor in self.tabulation.transitions(rows):
             joint = joint * factor
         return joint
-
-    def _transitions(self, rows: Rows) -> list[Tensor]:
-        pairs = zip(self.states, self.transitions, strict=True)
-        return [factor[rows] if self._varies(axis.name) else factor for axis, factor in pairs]
-
-    def _varies(self, name: str) -> bool:
-        """Whether a law differs between contexts, by itself or by way of deterministic variables."""
-        keyed = set(self.keys)
-        own = {axis.name for axis in self.axes}
-        for parent in self.laws.variables[name].parents:
-            if (parent.name, parent.lag) in keyed:
-                return True
-            if parent.lag == 0 and parent.name not in own and self._varies(parent.name):
-                return True
-        return False
-
-    # Tabulating.
-
-    def _forget(self) -> None:
-        self.tables: dict[str, Table] = {}
-        # The sizes of an observation's hypotheses: of statics, states before, states now; and without the past.
-        self.shapes: dict[str, tuple[int, ...]] = {}
-        self.now_shapes: dict[str, tuple[int, ...]] = {}
-        self.transitions: list[Tensor] = []
-
-    def _tabulate(self, context: Context | None) -> None:
-        """Add the tables of K new contexts, a chunk at a time."""
-        count = 1 if context is None else len(next(iter(context.values())))
-        axes = self.statics + self.previous + self.states
-        largest = max(torch.Size(self.structure.nodes[name].shape).numel() for name in self.model.observation_names)
-        step = max(1, CHUNK // max(1, largest * torch.Size(self.sizes).numel()))
-        starts = range(0, count, step)
-        for start in track(starts, "tabulating", transient=True) if len(starts) > 3 else starts:
-            part = {key: value[start : start + step] for key, value in (context or {}).items()}
-            self._append(Slice(self.laws, axes, part))
-
-    def _append(self, mesh: Slice) -> None:
-        first = not self.tables
-        transitions = [mesh.transition(axis).exp() for axis in self.states]
-        for i, (axis, new) in enumerate(zip(self.states, transitions, strict=True)):
-            wide = new.expand(mesh.contexts, *new.shape[1:])
-            if first:
-                self.transitions.append(wide if self._varies(axis.name) else new)
-            elif self._varies(axis.name):
-                self.transitions[i] = torch.cat([self.transitions[i], wide])
-        for name in self.model.observation_names:
-            law = mesh.law(name)
-            shape = tuple(law.batch_shape[1 : 1 + len(mesh.axes)])
-            flat, contexts = torch.Size(shape).numel(), mesh.contexts
-            parts = [p.expand(contexts, *p.shape[1:]) for p in tensors(law)]
-            parts = [p.reshape(contexts, flat, *p.shape[1 + len(shape) :]) for p in parts]
-            table = tabulate(with_tensors(law, parts, (contexts, flat), 1 + len(shape)), contexts, flat, self.generic)
-            if first:
-                self.tables[name], self.shapes[name] = table, shape
-                self.now_shapes[name] = self._now(shape)
-            else:
-                self.tables[name].append(table)
-            self.tables[name].settle()
 
 
 def _single(belief: FiniteBelief, value: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from apmodels import ValueOutOfRange
 from apmodels.simulation import Values, as_dict, check_actions
-from inference.tables import FEW_OUTCOMES
+from inference.table import FEW_OUTCOMES
 
 # How many numbers are held at a time.
 CHUNK = 8_000_000
@@ -26,7 +26,7 @@ def information_gain(engine: Any, belief: Any, actions: Any, samples: int, seed:
     acts = _choices(engine, actions)
     choices = len(next(iter(acts.values()))) if acts else 1
     count = len(belief.log_probs)
-    step = max(1, CHUNK // (max(samples, 1) * torch.Size(engine.sizes).numel()))
+    step = max(1, CHUNK // (max(samples, 1) * torch.Size(engine.layout.sizes).numel()))
     parts = []
     for pairs in torch.arange(count * choices).split(step):
         rows, chosen = pairs // choices, {name: values[pairs % choices] for name, values in acts.items()}
@@ -53,9 +53,9 @@ class _Imagination:
         part = replace(belief, batch=len(rows), log_probs=belief.log_probs[rows], known=known)
         _, context = engine.know(part, actions)
         self.engine = engine
-        self.rows = engine.find(context).expand(len(rows))
-        self.past = range(1 + len(engine.statics), 1 + len(engine.statics) + len(engine.previous))
-        if all(engine.is_late(name) for name in engine.tables):
+        self.rows = engine.tabulation.find(context).expand(len(rows))
+        self.past = range(1 + len(engine.layout.statics), 1 + len(engine.layout.statics) + len(engine.layout.previous))
+        if all(engine.tabulation.is_late(name) for name in engine.tabulation.tables):
             logs, _ = engine.predict(part.log_probs, self.rows, [])
             shape = logs.shape[: self.past.start] + (1,) * len(self.past) + logs.shape[self.past.start :]
             self.logs = logs.reshape(shape)
@@ -64,7 +64,7 @@ class _Imagination:
 
     def gain(self, samples: int, seed: int) -> Tensor:
         """Return the expected information of each row, nats, (R,)."""
-        outcomes = {name: table.outcomes for name, table in self.engine.tables.items()}
+        outcomes = {name: table.outcomes for name, table in self.engine.tabulation.tables.items()}
         few = [len(values) for values in outcomes.values() if values is not None]
         before = self._entropy(self.logs)
         if len(few) == len(outcomes) and torch.Size(few).numel() <= FEW_OUTCOMES:
@@ -93,8 +93,8 @@ class _Imagination:
         even = (torch.arange(samples, dtype=weights.dtype) + 0.5) / samples
         worlds = torch.searchsorted(cumulative, even * cumulative[:, -1:]).clamp(max=weights.shape[1] - 1)
         drawn = {}
-        for i, (name, table) in enumerate(self.engine.tables.items()):
-            shape = self.engine.shapes[name]
+        for i, (name, table) in enumerate(self.engine.tabulation.tables.items()):
+            shape = self.engine.tabulation.shapes[name]
             own = torch.arange(torch.Size(shape).numel()).reshape(shape).expand(self.logs.shape[1:]).flatten()
             drawn[name] = table.sample(self.rows, own[worlds], seed + i)
         return drawn
@@ -102,14 +102,14 @@ class _Imagination:
     def _posterior(self, seen: Values) -> Tensor:
         """log p(world, observation), up to what all worlds share, (R, S, *mesh)."""
         logs = self.logs[:, None]
-        exact = all(table.outcomes is not None for table in self.engine.tables.values())
-        for name, table in self.engine.tables.items():
+        exact = all(table.outcomes is not None for table in self.engine.tabulation.tables.values())
+        for name, table in self.engine.tabulation.tables.items():
             y = seen[name]
             rows = self.rows.repeat_interleave(y.shape[1])
             ratio = table.ratio(rows, y.flatten(0, 1))
             if exact:
                 ratio = ratio + table.base(rows, y.flatten(0, 1))[:, None]
-            logs = logs + ratio.reshape(*y.shape[:2], *self.engine.shapes[name])
+            logs = logs + ratio.reshape(*y.shape[:2], *self.engine.tabulation.shapes[name])
         return logs
 
     def _total(self, logs: Tensor) -> Tensor:

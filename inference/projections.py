@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
 from apmodels import ValueOutOfRange
 from apmodels.errors import nearest
+from apmodels.laws import Laws
+from apmodels.structure import Structure
+from inference.layout import Layout
 from inference.slices import Slice
 
 # The names asked for, and either the dimensions to keep or the group of each cell of the mesh.
@@ -18,8 +19,8 @@ Plan = tuple[dict[str, Tensor], list[int] | None, Tensor | None]
 class Projections:
     """How to sum log probabilities (B, *sizes) to those of some variables; worked out once for each set of names."""
 
-    def __init__(self, engine: Any):
-        self.engine = engine
+    def __init__(self, laws: Laws, structure: Structure, layout: Layout):
+        self.laws, self.structure, self.layout = laws, structure, layout
         self.plans: dict[tuple[str, ...], Plan] = {}
 
     def marginal(self, log_probs: Tensor, names: tuple[str, ...]) -> tuple[dict[str, Tensor], Tensor]:
@@ -42,23 +43,22 @@ class Projections:
         return -(logs.exp() * logs.clamp(min=torch.finfo(logs.dtype).min)).sum(-1)
 
     def _plan(self, names: tuple[str, ...]) -> Plan:
-        engine = self.engine
-        at = {axis.name: 1 + i for i, axis in enumerate(engine.axes)}
+        at = {axis.name: 1 + i for i, axis in enumerate(self.layout.axes)}
         if all(name in at for name in names) and [at[n] for n in names] == sorted(at[n] for n in names):
-            values = [engine.axes[at[name] - 1].values for name in names]
+            values = [self.layout.axes[at[name] - 1].values for name in names]
             picked = torch.cartesian_prod(*[torch.arange(len(v)) for v in values]).reshape(-1, len(values))
             return (
                 {n: v[picked[:, i]] for i, (n, v) in enumerate(zip(names, values, strict=True))},
                 [at[n] for n in names],
                 None,
             )
-        mesh = Slice(engine.laws, engine.axes, {})
+        mesh = Slice(self.laws, self.layout.axes, {})
         columns, shapes = [], []
         for name in names:
             value = self._on_mesh(mesh, name)
             shapes.append((value.dtype, value.shape[1 + len(at) :]))
-            wide = value.expand(1, *engine.sizes, *shapes[-1][1])
-            columns.append(wide.reshape(torch.Size(engine.sizes).numel(), -1).double())
+            wide = value.expand(1, *self.layout.sizes, *shapes[-1][1])
+            columns.append(wide.reshape(torch.Size(self.layout.sizes).numel(), -1).double())
         joint, groups = torch.unique(torch.cat(columns, 1), dim=0, return_inverse=True)
         split = joint.split([column.shape[1] for column in columns], 1)
         values = {
@@ -68,9 +68,9 @@ class Projections:
         return values, None, groups
 
     def _on_mesh(self, mesh: Slice, name: str) -> Tensor:
-        hidden = [node.name for node in self.engine.structure.hidden]
+        hidden = [node.name for node in self.structure.hidden]
         if name not in (*hidden, "interest"):
-            node = self.engine.structure.nodes.get(name)
+            node = self.structure.nodes.get(name)
             if node is None:
                 raise ValueOutOfRange(f"there is no variable {name}{nearest(name, hidden)}")
             raise ValueOutOfRange(f"{name} is {node.plan}, and no belief is held about it: see belief.known")
