@@ -8,9 +8,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from inspect import isfunction
+from typing import Any
+
+import torch
 
 from apmodels.errors import DeclarationError, nearest
-from apmodels.variables import PREVIOUS, ROLES, Parent, Variable
+from apmodels.spaces import Space
+from apmodels.variables import NO_SPACE, PREVIOUS, ROLES, Parent, Variable
 
 # What each role may have as a parent in this step.
 ALLOWED = {
@@ -53,6 +58,9 @@ def declare(cls: type) -> Declaration:
     for variable in found.values():
         for parent in variable.parents:
             _check_parent(cls, variable, parent, found)
+        _check_pins(cls, variable)
+        if variable.role == "action" and not (isinstance(variable.space, Space) or isfunction(variable.space)):
+            raise DeclarationError(f"{cls.__name__}.{variable.name} {NO_SPACE}")
     ordered = _in_order(cls, found)
     interest, names = _read_interest(cls, ordered)
     declaration = Declaration(cls.__name__, ordered, interest, names)
@@ -106,6 +114,16 @@ def _check_parent(cls: type, variable: Variable, parent: Parent, found: dict[str
             f"{where} is {_a(variable.role)} and cannot depend on the {role} {parent.name} of the same step "
             f"(the order is act, move, sense); {mend}"
         )
+
+
+def _check_pins(cls: type, variable: Variable) -> None:
+    arguments = {p.argument for p in variable.parents} | {p.name for p in variable.parents}
+    for name in variable.pins:
+        if name not in arguments:
+            raise DeclarationError(
+                f"{cls.__name__}.{variable.name} pins the kind of {name}, which is no parent of it"
+                f"{nearest(name, sorted(arguments))}"
+            )
 
 
 def _a(role: str) -> str:
@@ -206,3 +224,24 @@ def _check_befores(cls: type, declaration: Declaration) -> None:
                     f"{cls.__name__}.{variable.name}: {parent.argument} begins as {parent.before.name}, "
                     "which must be a @static variable of the model"
                 )
+    _check_one_before(cls, declaration)
+
+
+def _check_one_before(cls: type, declaration: Declaration) -> None:
+    firsts: dict[str, tuple[Variable, Any]] = {}
+    for variable in declaration.variables.values():
+        for parent in variable.parents:
+            if not parent.lag:
+                continue
+            other, before = firsts.setdefault(parent.name, (variable, parent.before))
+            if before is not parent.before and not _same(before, parent.before):
+                raise DeclarationError(
+                    f"{cls.__name__}: {parent.argument} begins as {before!r} in {other.name} and as "
+                    f"{parent.before!r} in {variable.name}; a variable has one value before time began"
+                )
+
+
+def _same(a: Any, b: Any) -> bool:
+    if isinstance(a, Variable) or isinstance(b, Variable) or callable(a) or callable(b):
+        return False
+    return torch.equal(torch.as_tensor(a).double(), torch.as_tensor(b).double())

@@ -17,7 +17,8 @@ from torch.distributions import Distribution, Independent, constraints
 from torch.distributions.transforms import Transform
 
 from apmodels.errors import ValueOutOfRange
-from apmodels.planted import Planted
+from apmodels.evidence import Evidence
+from apmodels.planted import Planted, elementwise_log_prob
 
 
 @contextmanager
@@ -87,13 +88,21 @@ def base_of(distribution: Any) -> tuple[Any, int]:
 
 
 def log_prob_of(distribution: Any, value: Tensor) -> Tensor:
-    """Return log p(value) in nats, in which elements that are NaN are missing; for scalars and ``to_event`` arrays."""
+    """Return log p(value) in nats, in which what is NaN is missing.
+
+    Elements may be missing one by one where they are independent; a joint law's value is missing as a whole, and
+    one of which a part is missing scores NaN.
+    """
     base, added = base_of(distribution)
-    if isinstance(base, Planted) or len(base.event_shape) or not value.is_floating_point():
+    if isinstance(base, (Planted, Evidence)) or not value.is_floating_point():
         return distribution.log_prob(value)
+    if not len(base.event_shape):
+        scores = elementwise_log_prob(base, value)
+        return scores.sum(tuple(range(-added, 0))) if added else scores
     missing = torch.isnan(value)
-    scores = torch.where(missing, 0.0, base.log_prob(torch.where(missing, 0.0, value)))
-    return scores.sum(tuple(range(-added, 0))) if added else scores
+    gone = missing.flatten(-len(distribution.event_shape))
+    scores = distribution.log_prob(torch.where(missing, 0.5, value))
+    return torch.where(gone.all(-1), 0.0, torch.where(gone.any(-1), torch.nan, scores))
 
 
 def family(distribution: Any) -> str:

@@ -72,7 +72,7 @@ def _places(structure: Any) -> dict[tuple[str, int], Place]:
         places[name, 0] = (middle + i * ACROSS, y)
         if name in lagged:
             places[name, 1] = (left, y)
-    right = middle + ACROSS + (ZIGZAG if len(named["state"]) > 1 else 0)
+    right = middle + ACROSS * max(1, len(named["observation"])) + (ZIGZAG if len(named["state"]) > 1 else 0)
     for i, name in enumerate(named["static"]):
         places[name, 0] = (right, top + i * DOWN)
     return places

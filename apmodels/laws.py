@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 from torch.func import vmap
 
-from apmodels.distributions import check_parameters, log_prob_of, tensors, unvalidated, with_tensors
+from apmodels.distributions import check_parameters, family, log_prob_of, tensors, unvalidated, with_tensors
 from apmodels.errors import DeclarationError, ValueOutOfRange
 from apmodels.evidence import Evidence
 from apmodels.variables import Variable
@@ -30,6 +30,7 @@ class Laws:
     def __init__(self, model: Any, dtype: torch.dtype | None = None):
         self.dtype = dtype or torch.get_default_dtype()
         self.model = cast(model, self.dtype)
+        self._real: dict[str, bool] = {}
         self.variables: dict[str, Variable] = dict(model.declaration.variables)
         if model.declaration.interest is not None:
             self.variables["interest"] = model.declaration.interest
@@ -62,7 +63,9 @@ class Laws:
             law = self._call(variable, dict(zip(parents, values, strict=True)))
             template[:] = [_checked_type(self.model, variable, law)]
             if isinstance(template[0], Evidence):
-                raise DeclarationError(f"{variable.owner}.{name} is an Evidence, which has no table")
+                raise DeclarationError(
+                    f"{type(self.model).__name__}.{name} is an Evidence, which can be scored but not drawn or tabulated"
+                )
             return tuple(tensors(template[0]))
 
         varying = [[value.shape[i] > 1 for value in parents.values()] for i in range(len(lead))]
@@ -104,7 +107,38 @@ class Laws:
         if callable(value):
             value = value(self.model)
         with _default_dtype(self.dtype):
-            return torch.as_tensor(value)
+            first = torch.as_tensor(value)
+        return first.to(self.dtype) if not first.is_floating_point() and self._is_real(name) else first
+
+    def _is_real(self, name: str) -> bool:
+        """Whether a variable's later values are floating-point numbers, though its first one is written whole."""
+        if name not in self._real:
+            self._real[name] = False
+            if self.variables[name].role == "action":
+                return False
+            with torch.random.fork_rng(devices=[]):
+                law = self._example(name)
+            self._real[name] = isinstance(law, Distribution) and family(law) != "Categorical"
+        return self._real[name]
+
+    def _example(self, name: str) -> Any:
+        """The law of a variable in one world at the first step."""
+        variable = self.variables[name]
+        values = {}
+        for parent in variable.parents:
+            before = self.before(parent.name) if parent.lag else None
+            if isinstance(before, Tensor):
+                values[parent.argument] = before
+                continue
+            source = parent.name if before is None else before.name
+            if self.variables[source].role == "action":
+                values[parent.argument] = self.variables[source].space_of(self.model).sample(())
+            else:
+                law = self._example(source)
+                values[parent.argument] = law.sample() if isinstance(law, Distribution) else law
+        # Unchecked: a whole first value may make a law that only its kind is asked of senseless.
+        with _default_dtype(self.dtype), unvalidated(), _explained(self.model, variable):
+            return self._call(variable, values)
 
     def _call(self, variable: Variable, parents: dict[str, Tensor]) -> Any:
         arguments = {parent.argument: parents[parent.argument] for parent in variable.parents}

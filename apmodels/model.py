@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from inspect import get_annotations
 from typing import Any, ClassVar, dataclass_transform
 
 import numpy as np
@@ -11,11 +12,12 @@ import torch
 from torch import Tensor
 
 from apmodels import declaration as declarations
-from apmodels import simulation
-from apmodels.errors import ValueOutOfRange, nearest
+from apmodels import scoring, simulation
+from apmodels.errors import DeclarationError, ValueOutOfRange, nearest
 from apmodels.laws import Laws
 from apmodels.simulation import Values
 from apmodels.spaces import Space
+from apmodels.variables import NO_SPACE, Variable
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
@@ -41,6 +43,9 @@ class Model:
         """Evaluate what has no parents, so that a wrong parameter fails when the model is built."""
         if "declaration" not in type(self).__dict__:
             raise TypeError(f"{type(self).__name__} is abstract: it declares no whole model; inherit from it")
+        for variable in self.declaration.of_role("action"):
+            if not isinstance(variable.space_of(self), Space):
+                raise DeclarationError(f"{type(self).__name__}.{variable.name} {NO_SPACE}")
         laws = Laws(self)
         for variable in self.declaration.of_role("static"):
             if not variable.parents:
@@ -96,7 +101,7 @@ class Model:
 
         Deterministic variables may be left out; observations that are NaN are missing.
         """
-        return simulation.log_prob(self, record)
+        return scoring.log_prob(self, record)
 
     @property
     def structure(self) -> Any:
@@ -119,7 +124,7 @@ class Model:
         return draw(self)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if not key.startswith("_")}
+        return {key: value for key, value in self.__dict__.items() if key != "_structure"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -139,14 +144,16 @@ def _equal(a: Any, b: Any) -> bool:
         return torch.equal(a, b)
     if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
         return np.array_equal(a, b)
+    if isinstance(a, (tuple, list)) and type(a) is type(b):
+        return len(a) == len(b) and all(_equal(x, y) for x, y in zip(a, b, strict=True))
     return bool(a == b)
 
 
 def _reserve(cls: type) -> None:
     """Refuse a variable that would hide a method which every model has."""
-    from apmodels.errors import DeclarationError
-    from apmodels.variables import Variable
-
-    for name, value in vars(cls).items():
-        if isinstance(value, Variable) and name in vars(Model):
+    reserved = {name for name in (*vars(Model), "declaration") if not name.startswith("__")}
+    fields = get_annotations(cls)
+    variables = [name for name, value in vars(cls).items() if isinstance(value, Variable)]
+    for name in (*variables, *fields):
+        if name in reserved:
             raise DeclarationError(f"{cls.__name__}.{name}: every model has a {name}; choose another name")

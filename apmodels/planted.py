@@ -38,12 +38,12 @@ class Planted(TorchDistribution):
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return log p(value), nats; elements that are NaN are missing."""
-        background = _present(self.elsewhere, value)
+        background = elementwise_log_prob(self.elsewhere, value)
         lead = torch.broadcast_shapes(value.shape[:-1], self.index.shape, background.shape[:-1])
         index = self.index.expand(lead).unsqueeze(-1)
         inside = value.expand(*lead, value.shape[-1]).gather(-1, index).squeeze(-1)
         replaced = background.expand(*lead, value.shape[-1]).gather(-1, index).squeeze(-1)
-        return background.sum(-1) - replaced + _present(self.here, inside)
+        return background.sum(-1) - replaced + elementwise_log_prob(self.here, inside)
 
     def sample(self, sample_shape: torch.Size | tuple = ()) -> Tensor:  # type: ignore[override]
         """Draw values, (*sample_shape, *batch, elements)."""
@@ -58,8 +58,11 @@ class Planted(TorchDistribution):
         return mean.scatter(-1, self.index.unsqueeze(-1), self.here.mean.unsqueeze(-1))
 
 
-def _present(law: Distribution, value: Tensor) -> Tensor:
+def elementwise_log_prob(law: Distribution, value: Tensor) -> Tensor:
+    """Return log p of independent elements, nats, 0 where an element is NaN, which means that it is missing."""
     if not value.is_floating_point():
         return law.log_prob(value)
     missing = torch.isnan(value)
-    return torch.where(missing, 0.0, law.log_prob(torch.where(missing, 0.0, value)))
+    # What stands in for them must have a score and a gradient, and 0 and 1 are often at an edge.
+    stand_in = 0.0 if law.support.is_discrete else 0.5  # type: ignore[union-attr]
+    return torch.where(missing, 0.0, law.log_prob(torch.where(missing, stand_in, value)))

@@ -23,7 +23,10 @@ from apmodels.transforms import recording_moves
 from apmodels.variables import Parent, Variable
 
 WORLDS = 24
-STEPS = 4
+STEPS = 40
+# How many combinations of finite values, and how many numbers, one probe may look at.
+COMBINATIONS = 1024
+NUMBERS = 20_000_000
 # Where on the line through two worlds (0 and 1) a law is evaluated.
 LINE = (0.0, 1.0, 0.37, -1.0, 2.6, -4.3, 11.0, -23.0, 61.0)
 LARGEST_SUPPORT = 4096
@@ -39,55 +42,83 @@ def support_of(law: Any) -> Tensor | None:
     if not base.has_enumerate_support or isinstance(base, Evidence):
         return None
     try:
-        if added == 0:
-            return law.enumerate_support(expand=False)
-        flat = type(base).enumerate_support(base, expand=False).flatten()
+        values = type(base).enumerate_support(base, expand=False)
     except NotImplementedError:
         return None
-    elements = torch.Size(law.event_shape).numel()
-    if len(flat) ** elements > LARGEST_SUPPORT:
+    # One element's values (n, *its shape), and every combination of the elements'.
+    values = values.reshape(len(values), *base.event_shape)
+    elements = torch.Size(law.event_shape[:added]).numel()
+    if len(values) ** elements > LARGEST_SUPPORT:
         return None
-    return torch.cartesian_prod(*[flat] * elements).reshape(-1, *law.event_shape)
+    picks = torch.cartesian_prod(*[torch.arange(len(values))] * elements)
+    return values[picks].reshape(-1, *law.event_shape)
 
 
 class _ProbedWorlds(Worlds):
-    """Worlds whose observations need not be drawable."""
+    """Worlds whose observations are only drawn where some law asks for them."""
 
     laws_of: dict[str, Any]
 
     def _draw(self, variable: Variable, values: Values) -> Tensor:
         if not hasattr(self, "laws_of"):
             self.laws_of = {}
-        arguments = self.parents(variable, values)
-        law = self.laws.one(variable.name, {name: value[0] for name, value in arguments.items()})
-        self.laws_of[variable.name] = law
-        if isinstance(law, Evidence):
+            everybody = self.laws.variables.values()
+            self.asked_for = {parent.name for other in everybody for parent in other.parents}
+        seen_once = variable.name in self.laws_of
+        if not seen_once:
+            arguments = self.parents(variable, values)
+            law = self.laws.one(variable.name, {name: value[0] for name, value in arguments.items()})
+            self.laws_of[variable.name] = law
+        if variable.role == "observation" and variable.name not in self.asked_for:
             return torch.full((self.batch,), torch.nan)
         return super()._draw(variable, values)
 
 
 class Probe:
-    """Random worlds of one model after a few steps of random actions, and what its laws do there."""
+    """Random worlds of one model over some steps of random actions, and what its laws do there."""
 
     def __init__(self, model: Any):
-        try:
-            self._draw(model, torch.float64, 1e-7)
-        except DeclarationError as error:
-            # A field that is not a dataclass (a network, say) may keep its own precision.
-            if "dtype" not in str(error) and "same type" not in str(error):
-                raise
-            self._draw(model, torch.float32, 1e-3)
         self.variables = model.declaration.variables
+        with torch.no_grad():
+            try:
+                self._draw(model, torch.float64, 1e-7)
+            except DeclarationError as error:
+                # A field that is not a dataclass (a network, say) may keep its own precision.
+                if "dtype" not in str(error) and "same type" not in str(error):
+                    raise
+                self._draw(model, torch.float32, 1e-3)
 
     def _draw(self, model: Any, dtype: torch.dtype, tolerance: float) -> None:
         self.laws = Laws(model, dtype)
         self.tolerance = tolerance
+        pools: dict[str, list[Tensor]] = {}
         with seeded(0):
             worlds = _ProbedWorlds(self.laws, WORLDS)
-            for _ in range(STEPS):
+            for step in range(STEPS):
                 before = worlds.previous
                 worlds.step({name: model.space(name).sample((WORLDS,)) for name in model.action_names})
-        self.values, self.previous, self.laws_of = worlds.values, before, worlds.laws_of
+                if step == 3:
+                    self.values, self.previous = worlds.values, before
+                for name, value in (*worlds.values.items(), *before.items()):
+                    pools.setdefault(name, []).append(value)
+        self.laws_of = worlds.laws_of
+        wanted = worlds.asked_for & set(pools)
+        self.pools = {name: self._all_values(model, name, pools[name]) for name in wanted}
+
+    def _all_values(self, model: Any, name: str, found: list[Tensor]) -> Tensor | None:
+        """Every value that a variable is known to take, if they may be few; None for a continuum."""
+        role = self.variables[name].role
+        listed = model.space(name).values() if role == "action" and model.space(name).size else None
+        if role != "action" and self.is_random(name):
+            listed = support_of(self.laws_of[name])
+        if listed is None and (role == "action" or self.is_random(name)):
+            return None
+        kinds = {value.dtype for value in found}
+        rows = [value.reshape(len(value), -1) for value in found if value.dtype == found[-1].dtype or len(kinds) == 1]
+        seen = torch.unique(torch.cat(rows), dim=0).reshape(-1, *found[-1].shape[1:])
+        if listed is None:
+            return seen if len(seen) <= COMBINATIONS else None
+        return torch.cat([listed.to(seen.dtype), seen])
 
     def is_random(self, name: str) -> bool:
         """Tell whether a variable's law is a distribution."""
@@ -100,6 +131,10 @@ class Probe:
         """
         if not continuous:
             return {}
+        with torch.no_grad():
+            return self._kinds(child, continuous, conjugate)
+
+    def _kinds(self, child: Variable, continuous: list[Parent], conjugate: list[Parent]) -> dict[str, Kind]:
         if conjugate and self._selects(child, continuous, conjugate):
             chosen = {p.argument: ("selects", "its probability is one of the components") for p in conjugate}
             rest = [p for p in continuous if p not in conjugate]
@@ -113,7 +148,9 @@ class Probe:
         kinds: dict[str, Kind] = {}
         rest = []
         for parent in continuous:
-            if self._is_affine(child, [parent]):
+            if not self._value(parent).is_floating_point():
+                kinds[parent.argument] = ("nonlinear", "a whole number that follows from a continuum")
+            elif self._is_affine(child, [parent]):
                 rest.append(parent)
             else:
                 kinds[parent.argument] = ("nonlinear", "not affine in it, all else fixed")
@@ -136,43 +173,53 @@ class Probe:
     def _value(self, parent: Parent) -> Tensor:
         return (self.previous if parent.lag else self.values)[parent.name]
 
-    def _arguments(self, child: Variable) -> Values:
-        return {p.argument: self._value(p) for p in child.parents}
-
-    def _moving(self, child: Variable, moving: list[Parent]) -> Values:
-        """Return arguments (WORLDS, len(LINE), ...) in which some parents move to another world's value and beyond."""
-        line = torch.tensor(LINE, dtype=self.laws.dtype)
-        names = {p.argument for p in moving}
-        moved = {}
-        for name, value in self._arguments(child).items():
-            along = value[:, None].expand(WORLDS, len(LINE), *value.shape[1:])
-            if name in names:
-                t = line.reshape(1, -1, *[1] * (value.dim() - 1))
-                along = along + t * (value.roll(1, 0) - value + 1e-3 * (value == value.roll(1, 0)))[:, None]
-            moved[name] = along
-        return moved
+    def _arguments(self, child: Variable, continuous: list[Parent]) -> Values:
+        """A law's arguments in W worlds (W, *shape), in which whatever is finite takes all its values."""
+        names = {p.argument for p in continuous}
+        drawn = {p.argument: self._value(p) for p in child.parents}
+        pools = {p.argument: self.pools[p.name] for p in child.parents if p.argument not in names}
+        pools = {name: pool for name, pool in pools.items() if pool is not None and len(pool) > 1}
+        most = max(WORLDS, NUMBERS // (len(LINE) * max(value[0].numel() for value in drawn.values())))
+        count, picks = _design([len(pool) for pool in pools.values()], min(COMBINATIONS, most))
+        worlds = max(WORLDS, count)
+        tiled = {name: value[torch.arange(worlds) % WORLDS] for name, value in drawn.items()}
+        for (name, pool), pick in zip(pools.items(), picks, strict=True):
+            tiled[name] = pool[pick[torch.arange(worlds) % count]].to(drawn[name].dtype)
+        return tiled
 
     def _is_affine(self, child: Variable, moving: list[Parent]) -> bool:
+        continuous = [p for p in child.parents if self.pools[p.name] is None]
+        here = self._arguments(child, continuous)
+        line = torch.tensor(LINE, dtype=self.laws.dtype)
+        worlds = len(next(iter(here.values())))
+        names = {p.argument for p in moving}
+        moved = {}
+        for name, value in here.items():
+            along = value[:, None]
+            if name in names:
+                t = line.reshape(1, -1, *[1] * (value.dim() - 1))
+                # Towards another world, all together; a little aside where that one is the same.
+                other = value.roll(1, 0)
+                along = along + t * (other - value + 1e-3 * (value == other))[:, None]
+            moved[name] = along
         try:
-            law = self.laws.many(child.name, self._moving(child, moving), (WORLDS, len(LINE)))
-        except ValueOutOfRange:
+            law = self.laws.many(child.name, moved, (worlds, len(LINE)))
+        except (ValueOutOfRange, DeclarationError):
+            # A law that fails beyond the values that its parent takes is nonlinear enough.
             return False
-        if isinstance(law, Tensor):
-            centre, spreads = law.to(self.laws.dtype), []
-        else:
-            given = parameters(law)
-            centre = given["loc"]
-            spreads = [value for name, value in given.items() if name != "loc"]
-        line = torch.tensor(LINE, dtype=centre.dtype).reshape(1, -1, *[1] * (centre.dim() - 2))
-        predicted = centre[:, :1] + line * (centre[:, 1:2] - centre[:, :1])
+        centre = law.to(self.laws.dtype) if isinstance(law, Tensor) else parameters(law)["loc"]
+        spreads = [] if isinstance(law, Tensor) else [v for name, v in parameters(law).items() if name != "loc"]
+        t = line.to(centre.dtype).reshape(1, -1, *[1] * (centre.dim() - 2))
+        predicted = centre[:, :1] + t * (centre[:, 1:2] - centre[:, :1])
         return self._same(predicted, centre) and all(self._same(s[:, :1].expand_as(s), s) for s in spreads)
 
     def _same(self, a: Tensor, b: Tensor) -> bool:
-        scale = max(1.0, float(b.abs().max())) if b.numel() else 1.0
+        """Whether values (W, line, ...) agree, by the scale of each component on each line: units do not matter."""
+        scale = torch.maximum(a.abs(), b.abs()).amax(1, keepdim=True)
         return bool(((a - b).abs() <= self.tolerance * scale).all())
 
     def _moved(self, child: Variable, parent: Parent) -> str | None:
-        arguments = {name: value[0] for name, value in self._arguments(child).items()}
+        arguments = {p.argument: self._value(p)[0] for p in child.parents}
         with recording_moves() as moves:
             law = self.laws.one(child.name, arguments)
         centre = law if isinstance(law, Tensor) else parameters(law)["loc"]
@@ -184,29 +231,55 @@ class Probe:
 
     def _selects(self, child: Variable, continuous: list[Parent], conjugate: list[Parent]) -> bool:
         """Tell whether, in every world, the child's probability is a component of a parent, whatever its value."""
-        here = self._arguments(child)
-        names = {p.argument for p in continuous}
-        there = {name: value.roll(1, 0) if name in names else value for name, value in here.items()}
+        here = self._arguments(child, continuous)
+        worlds = len(next(iter(here.values())))
         row = self._event_row(child)
-        matches, changed = None, None
-        for arguments in (here, there):
-            law = self.laws.many(child.name, arguments, (WORLDS,))
+        matches, before, changed = None, None, None
+        for seed in (1, 2):
+            arguments = here | {p.argument: self._anything(p, worlds, seed) for p in conjugate}
+            rest = {p.argument for p in continuous} - {p.argument for p in conjugate}
+            arguments |= {name: here[name].roll(seed, 0) for name in rest}
+            law = self.laws.many(child.name, arguments, (worlds,))
             chosen = _probability(law, row)
-            options = torch.cat([arguments[p.argument].reshape(WORLDS, -1, row) for p in conjugate], 1)
-            equal = ((chosen[:, :, None] - options[:, None]).abs() <= self.tolerance * options[:, None].abs()).all(-1)
+            options = torch.cat([arguments[p.argument].reshape(worlds, -1, row) for p in conjugate], 1)
+            close = (chosen[:, :, None] - options[:, None]).abs() <= self.tolerance * options[:, None].abs()
+            equal = close.all(-1)
             matches = equal if matches is None else matches & equal
-            changed = chosen if changed is None else ((chosen - changed).abs() > 0).any(-1)
+            changed = None if before is None else ((chosen - before).abs() > 0).any(-1)
+            before = chosen
         if matches is None or changed is None:
             return False
         return bool((matches.any(-1) | ~changed).all() and matches.any())
+
+    def _anything(self, parent: Parent, worlds: int, seed: int) -> Tensor:
+        """Values that a Beta, Dirichlet or Gamma could take, likely under its prior or not, (worlds, *shape)."""
+        shape = (worlds, *self._value(parent).shape[1:])
+        generator = torch.Generator().manual_seed(seed)
+        flat = torch.rand(shape, generator=generator, dtype=self.laws.dtype)
+        name = family(self.laws_of[parent.name])
+        if name == "Beta":
+            return flat
+        wide = -flat.log() * torch.exp(4 * torch.rand(shape, generator=generator, dtype=self.laws.dtype))
+        return wide / wide.sum(-1, keepdim=True) if name == "Dirichlet" else wide
 
     def _event_row(self, child: Variable) -> int:
         base, _ = base_of(self.laws_of[child.name])
         return base.probs.shape[-1] if type(base).__name__ == "Categorical" else 1
 
 
+def _design(sizes: list[int], most: int) -> tuple[int, list[Tensor]]:
+    """How many worlds, and which value of each finite parent in each: all combinations, or all values in turn."""
+    total = torch.Size(sizes).numel()
+    if total <= most:
+        grid = torch.cartesian_prod(*[torch.arange(n) for n in sizes]).reshape(total, -1) if sizes else None
+        return total, [] if grid is None else list(grid.unbind(1))
+    count = max(most, *sizes)
+    generator = torch.Generator().manual_seed(0)
+    return count, [torch.arange(count)[torch.randperm(count, generator=generator)] % n for n in sizes]
+
+
 def _probability(law: Any, row: int) -> Tensor:
-    """Return the child's probabilities or rates, (WORLDS, elements, row)."""
+    """Return the child's probabilities or rates, (worlds, elements, row)."""
     base, _ = base_of(law)
     values = base.rate if type(base).__name__ == "Poisson" else base.probs
-    return values.reshape(WORLDS, -1, row)
+    return values.reshape(len(values), -1, row)

@@ -1,4 +1,4 @@
-"""Drawing worlds from a model, many at a time, and scoring whole records of them."""
+"""Drawing worlds from a model, many at a time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from apmodels.errors import ValueOutOfRange
+from apmodels.distributions import base_of
+from apmodels.errors import ValueOutOfRange, nearest
 from apmodels.laws import Laws
 from apmodels.variables import Variable
 
@@ -36,6 +37,10 @@ class Worlds:
         self.batch = batch
         self.given = {name: torch.as_tensor(value) for name, value in (given or {}).items()}
         declaration = laws.model.declaration
+        for name in self.given:
+            if name not in declaration.names["static"]:
+                statics = nearest(name, declaration.names["static"])
+                raise ValueOutOfRange(f"{type(laws.model).__name__} has no static {name} to give{statics}")
         self.statics: Values = {}
         self.values: Values = {}
         for variable in declaration.of_role("static"):
@@ -68,10 +73,26 @@ class Worlds:
 
     def _draw(self, variable: Variable, values: Values) -> Tensor:
         if variable.name in self.given:
-            given = self.given[variable.name]
-            return given.expand(self.batch, *given.shape[1:]) if given.dim() else given.expand(self.batch)
+            parents = {name: value[0] for name, value in self.parents(variable, values).items()}
+            law = self.laws.one(variable.name, parents)
+            where = f"{type(self.laws.model).__name__}.{variable.name}"
+            return fitted(law, self.given[variable.name], self.batch, where)
         law = self.law(variable, values)
         return law.sample() if isinstance(law, Distribution) else law
+
+
+def fitted(law: Tensor | Distribution, value: Tensor, batch: int, where: str) -> Tensor:
+    """Return a value that was given for a variable as (batch, *shape); ValueOutOfRange where it cannot be one."""
+    shape = tuple(law.shape if isinstance(law, Tensor) else law.event_shape)
+    if tuple(value.shape) not in (shape, (1, *shape), (batch, *shape)):
+        raise ValueOutOfRange(f"{where} has shape {tuple(value.shape)}; one value has shape {shape}, of {batch} worlds")
+    base = base_of(law)[0] if isinstance(law, Distribution) else None
+    good = ~torch.isinf(value)
+    if base is not None and not len(base.event_shape) and base.support.is_discrete:
+        good = torch.isnan(value) | base.support.check(value)
+    if not bool(good.all()):
+        raise ValueOutOfRange(f"{where} is {value[~good].flatten()[0]:g}, which it can never be")
+    return value.expand(batch, *shape)
 
 
 def as_dict(values: Any, names: list[str], what: str) -> Values:
@@ -87,12 +108,19 @@ def as_dict(values: Any, names: list[str], what: str) -> Values:
         missing = [name for name in names if name not in values]
         if unknown or missing:
             raise ValueOutOfRange(f"the {what}s are {names}; unknown: {unknown}, missing: {missing}")
-        return {name: torch.as_tensor(values[name]) for name in names}
+        return {name: _as_tensor(values[name], f"{what} {name}") for name in names}
     if values is None:
         raise ValueOutOfRange(f"an {what} is needed: {names}")
     if len(names) > 1:
         raise ValueOutOfRange(f"this model has several {what}s; pass a dict by name: {names}")
-    return {names[0]: torch.as_tensor(values)}
+    return {names[0]: _as_tensor(values, f"{what} {names[0]}")}
+
+
+def _as_tensor(value: Any, what: str) -> Tensor:
+    try:
+        return torch.as_tensor(value)
+    except (TypeError, ValueError, RuntimeError):
+        raise ValueOutOfRange(f"the {what} is {value!r}, and no number or array of numbers") from None
 
 
 def as_given(values: Values) -> Any:
@@ -113,6 +141,8 @@ def simulate(
     model: Any, steps: int, actions: Any, batch: int | None, seed: int | None, given: Mapping[str, Any] | None
 ) -> Values:
     """See ``Model.simulate``."""
+    if steps < 1 or (batch is not None and batch < 1):
+        raise ValueOutOfRange(f"there must be 1 step or more and 1 record or more, not {steps} and {batch}")
     count = 1 if batch is None else batch
     names = model.action_names
     with seeded(seed):
@@ -134,65 +164,14 @@ def _actions(model: Any, actions: Any, names: list[str], steps: int, batch: int 
     if actions is None:
         return {name: space.sample((batch or 1, steps)) for name, space in spaces.items()}
     given = check_actions(model, as_dict(actions, names, "action"))
-    whole = {}
-    for name, value in given.items():
-        inner = len(spaces[name].shape)
-        if value.dim() - inner == 0 or value.shape[value.dim() - inner - 1] != steps:
-            raise ValueOutOfRange(f"{steps} steps need {steps} actions {name}, but it has shape {tuple(value.shape)}")
-        if value.dim() - inner == 1:
-            value = value.expand(batch or 1, *value.shape)
-        whole[name] = value
-    return whole
+    return {name: _record_of(name, value, spaces[name].shape, steps, batch) for name, value in given.items()}
 
 
-def log_prob(model: Any, record: Mapping[str, Tensor]) -> Tensor:
-    """See ``Model.log_prob``."""
-    declaration = model.declaration
-    statics = [v.name for v in declaration.of_role("static")]
-    timed = [v for v in declaration.of_role("action", "state", "observation") if v.name in record]
-    if not timed:
-        raise ValueOutOfRange(f"a record of {type(model).__name__} needs {list(declaration.variables)}")
-    laws = Laws(model)
-    space = timed[0].space_of(model) if timed[0].role == "action" else None
-    batched = _is_batched(model, laws, record, timed[0], space)
-    record = {name: torch.as_tensor(v) if batched else torch.as_tensor(v)[None] for name, v in record.items()}
-    first = record[timed[0].name]
-    scorer = _Scorer(laws, first.shape[0], {name: record[name] for name in statics if name in record})
-    for t in range(first.shape[1]):
-        scorer.given = {variable.name: record[variable.name][:, t] for variable in timed}
-        scorer.step({variable.name: scorer.given[variable.name] for variable in timed if variable.role == "action"})
-    return scorer.total if batched else scorer.total[0]
-
-
-def _is_batched(model: Any, laws: Laws, record: Mapping[str, Tensor], timed: Variable, space: Any) -> bool:
-    """Tell (batch, time, *shape) from (time, *shape) by the shape that the variable has in one world."""
-    if space is not None:
-        shape = space.shape
-    else:
-        with seeded(0):
-            worlds = Worlds(laws, 1)
-            worlds.step({name: model.space(name).sample((1,)) for name in model.action_names})
-        shape = worlds.values[timed.name].shape[1:]
-    return torch.as_tensor(record[timed.name]).dim() - len(shape) == 2
-
-
-class _Scorer(Worlds):
-    """Worlds that are given instead of drawn: each random variable adds its log probability."""
-
-    def __init__(self, laws: Laws, batch: int, given: Values):
-        self.total = torch.zeros(batch)
-        super().__init__(laws, batch, given)
-
-    def _draw(self, variable: Variable, values: Values) -> Tensor:
-        parents = self.parents(variable, values)
-        example = self.laws.one(variable.name, {name: value[0] for name, value in parents.items()})
-        if isinstance(example, Tensor):
-            return self.law(variable, values)  # type: ignore[return-value]
-        if variable.name not in self.given:
-            raise ValueOutOfRange(f"the record has no {variable.role} {variable.name}, which is random")
-        value = self.given[variable.name]
-        value = value.to(self.laws.dtype) if value.is_floating_point() else value
-        if variable.role != "observation" and value.is_floating_point() and torch.isnan(value).any():
-            raise ValueOutOfRange(f"{variable.name} is NaN; only observations may be missing")
-        self.total = self.total + self.laws.score(variable.name, parents, value, (self.batch,))
-        return value
+def _record_of(name: str, value: Tensor, shape: tuple[int, ...], steps: int, batch: int | None) -> Tensor:
+    """A record of actions as (batch, steps, *shape)."""
+    lead = tuple(value.shape[: value.dim() - len(shape)])
+    if lead not in ((steps,), (1, steps), (batch or 1, steps)):
+        each = f" in each of {batch} records" if batch else ""
+        shape = tuple(value.shape)
+        raise ValueOutOfRange(f"{steps} steps need {steps} actions {name}{each}, but it has shape {shape}")
+    return value.expand(batch or 1, steps, *shape)

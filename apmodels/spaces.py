@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import pyro.distributions as dist
@@ -69,7 +69,7 @@ class Finite(Space):
         """Return ``value`` as int64 (*batch,); ValueOutOfRange where it is not in the space."""
         given = torch.as_tensor(value)
         if given.dim() == 0 and not given.dtype.is_floating_point and 0 <= int(given) < self.size:
-            return given
+            return given.to(torch.int64)
         whole = given if not given.dtype.is_floating_point else _whole(given, name, self)
         whole = whole.to(torch.int64)
         low, high = torch.aminmax(whole) if whole.numel() else (0, 0)
@@ -90,7 +90,8 @@ def _whole(given: Tensor, name: str, space: Space) -> Tensor:
 class Binary(Finite):
     """Zero or one."""
 
-    count: int = 2
+    count: int = field(default=2, init=False)
+    names: tuple[str, ...] = field(default=(), init=False)
 
     def __repr__(self) -> str:
         return "Binary()"
@@ -163,7 +164,7 @@ class Box(Space):
 
     def sample(self, shape: tuple[int, ...] = ()) -> Tensor:
         """Draw values uniformly, (*shape, *dims)."""
-        return torch.rand(*shape, *self.dims) * (self.high - self.low) + self.low
+        return torch.rand((*shape, *self.dims)) * (self.high - self.low) + self.low
 
     def check(self, value: Any, name: str = "action") -> Tensor:
         """Return ``value`` as floats (*batch, *dims); ValueOutOfRange where it is not in the space."""

@@ -114,7 +114,11 @@ class _Reader:
 
     def structure(self) -> Structure:
         nodes = {name: self._node(variable) for name, variable in self.variables.items()}
-        return Structure(type(self.model).__name__, nodes, tuple(self.arrows), self.model.declaration.interest_names)
+        interest = self.model.declaration.interest_names
+        if getattr(type(self.model), "interest", None) is None:
+            # Where nobody said what is of interest, all that is hidden is.
+            interest = tuple(name for name in interest if nodes[name].hidden)
+        return Structure(type(self.model).__name__, nodes, tuple(self.arrows), interest)
 
     # Which variables are known, and which have finitely many values: the largest sets that hold together.
 

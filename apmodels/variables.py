@@ -17,6 +17,7 @@ from apmodels.errors import DeclarationError
 
 PREVIOUS = "prev_"
 ROLES = ("static", "action", "state", "observation")
+NO_SPACE = "has no space; write action(Binary()), action(Grid(7, 7)), or action(lambda self: self.grid)"
 KINDS = ("finite", "selects", "affine", "moves", "given", "nonlinear")
 
 

@@ -20,6 +20,10 @@ class Controller(ABC):
     """
 
     def __init__(self, engine: Engine, seed: int = 0):
+        if not isinstance(engine, Engine):
+            raise Refusal(
+                f"{type(self).__name__} needs an engine, not a {type(engine).__name__}: inference.choose(model)"
+            )
         self.engine = engine
         self.model = engine.model
         self.reset(seed)

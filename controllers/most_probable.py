@@ -29,7 +29,8 @@ class MostProbable(Controller):
         super().__init__(engine, seed)
         name, space = self.only_action()
         interest = engine.structure.interest
-        values = engine.structure.nodes[interest[0]].values if len(interest) == 1 else None
+        whole = len(interest) == 1 and engine.model.declaration.interest is None
+        values = engine.structure.nodes[interest[0]].values if whole else None
         same = values is not None and space.size == len(values)
         if not same or not torch.equal(values.double(), space.values().double()):  # type: ignore[union-attr]
             raise Refusal(

@@ -12,6 +12,7 @@ import xarray as xr
 from rich.progress import Progress
 from torch import Tensor
 
+from apmodels import ValueOutOfRange
 from apmodels.simulation import as_dict
 from controllers.controller import Controller
 from inference import Belief, Engine
@@ -45,6 +46,8 @@ def rollout(
         (nats); ``marginal`` of the interest, or ``marginal_NAME`` where it is several variables; ``log_evidence``;
         ``act_seconds``, ``body_seconds``, ``update_seconds`` (time); ``truth_NAME`` where the body knows the truth.
     """
+    if steps < 1:
+        raise ValueOutOfRange(f"a rollout needs 1 step or more, not {steps}")
     body.reset(seed)
     controller.reset(seed)
     belief = engine.start(getattr(body, "batch", None))
@@ -82,7 +85,10 @@ class _Record:
         self.single = belief.batch is None
         self.columns: dict[str, list[np.ndarray]] = {}
         self.seconds: list[tuple[float, float, float]] = []
-        self.interest = engine.structure.interest
+        self.batch = belief.batch
+        self.shapes = {name: space.shape for name, space in engine.spaces.items()}
+        function = engine.model.declaration.interest is not None
+        self.interest = ("interest",) if function else engine.structure.interest
 
     def note(self, action: Any, observation: Any, belief: Belief, seconds: tuple[float, float, float]) -> None:
         model = self.engine.model
@@ -103,6 +109,8 @@ class _Record:
 
     def _put(self, name: str, value: Any) -> None:
         array = np.asarray(value)
+        if self.batch is not None and array.shape == self.shapes.get(name):
+            array = np.broadcast_to(array, (self.batch, *array.shape))
         self.columns.setdefault(name, []).append(array[None] if self.single else array)
 
     def dataset(self) -> xr.Dataset:

@@ -13,6 +13,9 @@ ENGINES: list[type[Engine]] = [Exact]
 
 def bids(model: Model) -> dict[str, Any]:
     """Return every engine's bid for a model, by the engine's name, the best first."""
+    if not isinstance(model, Model):
+        what = f"the class {model.__name__}" if isinstance(model, type) else f"a {type(model).__name__}"
+        raise Refusal(f"an engine needs a model, not {what}; write MyModel(...)")
     made = {engine.__name__: engine.bid(model.structure) for engine in ENGINES}
     return dict(sorted(made.items(), key=lambda item: -item[1].competence))
 

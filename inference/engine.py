@@ -40,6 +40,9 @@ class Engine(ABC):
     """
 
     def __init__(self, model: Model, dtype: torch.dtype | None = None):
+        if not isinstance(model, Model):
+            what = f"the class {model.__name__}" if isinstance(model, type) else f"a {type(model).__name__}"
+            raise Refusal(f"{type(self).__name__} needs a model, not {what}; write {type(self).__name__}(MyModel(...))")
         self.model = model
         self.structure: Structure = model.structure
         bid = self.bid(self.structure)
@@ -49,6 +52,9 @@ class Engine(ABC):
         self.dtype = self.laws.dtype
         self.spaces = {name: model.space(name) for name in model.action_names}
         self.shown = {name: self.structure.nodes[name].shape for name in model.observation_names}
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.model!r})"
 
     @classmethod
     @abstractmethod
@@ -89,12 +95,17 @@ class Engine(ABC):
         """Return the beliefs after each step of a record, (steps, *shape) or (batch, steps, *shape)."""
         acts = as_dict(actions, self.model.action_names, "action")
         seen = as_dict(observations, self.model.observation_names, "observation")
+        shapes = {name: space.shape for name, space in self.spaces.items()} | self.shown
+        # A record without a batch dimension goes for the whole batch.
+        at = {name: value.dim() - len(shapes[name]) - 1 for name, value in (acts | seen).items()}
+        lengths = {name: value.shape[at[name]] for name, value in (acts | seen).items()}
+        if len(set(lengths.values())) > 1:
+            raise ValueOutOfRange(f"the records differ in their number of steps: {lengths}")
         beliefs = []
         belief = self.start(batch)
-        at = 0 if batch is None else 1
-        for t in range(next(iter(seen.values())).shape[at]):
-            act = {name: value.select(at, t) for name, value in acts.items()}
-            belief = self.update(belief, act or None, {name: v.select(at, t) for name, v in seen.items()})
+        for t in range(next(iter(lengths.values()))):
+            act, see = ({name: v.select(at[name], t) for name, v in record.items()} for record in (acts, seen))
+            belief = self.update(belief, act or None, see)
             beliefs.append(belief)
         return beliefs
 
@@ -106,6 +117,7 @@ class Engine(ABC):
         for name, value in given.items():
             space = self.spaces[name]
             value = space.check(value, f"{type(self.model).__name__}.{name}")
+            value = value.to(self.dtype) if value.is_floating_point() else value
             checked[name] = self._batched(name, value, space.shape, batch)
         return checked
 

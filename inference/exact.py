@@ -56,6 +56,8 @@ class Exact(Engine):
 
     def start(self, batch: int | None = None) -> FiniteBelief:
         """Return the prior: statics by their laws, states at their values before time began."""
+        if batch is not None and batch < 1:
+            raise ValueOutOfRange(f"a batch of {batch} beliefs is empty; give 1 or more, or None")
         rows = 1 if batch is None else batch
         mesh = Slice(self.laws, self.layout.axes, {})
         log_probs = torch.zeros((1,) * (1 + len(self.layout.axes)), dtype=self.dtype)
@@ -64,7 +66,7 @@ class Exact(Engine):
         for axis in self.layout.states:
             log_probs = log_probs + self._before(mesh, axis)
         log_probs = log_probs.expand(rows, *self.layout.sizes).contiguous()
-        known = {name: _rows(self.laws.before(name), rows) for name in self.layout.kept}
+        known = {name: _rows(self._first(mesh, name), rows) for name in self.layout.kept}
         evidence = torch.zeros(() if batch is None else rows, dtype=self.dtype)
         return FiniteBelief(self, batch, 0, evidence, known, log_probs)
 
@@ -87,13 +89,13 @@ class Exact(Engine):
             else:
                 early.append(ratio.reshape(count, *self.tabulation.shapes[name]))
         log_probs, shift = self.predict(belief.log_probs, rows, early)
-        weights = sum(late, start=log_probs).flatten(1)
+        weights = sum(late, start=log_probs).reshape(count, -1)
         log_probs = weights.log_softmax(1)
         # Normalising lowers every log weight by the log of their sum, the largest too.
         total = weights.amax(1) - log_probs.amax(1)
         if not math.isfinite(float(total if count == 1 else total.sum())):
             raise ValueOutOfRange(f"{type(self.model).__name__} gives what was observed no probability at all")
-        log_probs = log_probs.reshape(count, *self.layout.sizes)
+        log_probs = self.layout.padded(log_probs.reshape(count, *self.layout.present_sizes))
         evidence = total + evidence if shift is None else total + evidence + shift
         evidence = belief.log_evidence + (evidence[0] if belief.batch is None else evidence)
         kept = self._kept(known | actions, seen) if self.layout.kept else {}
@@ -108,7 +110,7 @@ class Exact(Engine):
         joint = self.joint(belief.log_probs, rows)
         made = {}
         for name in self.tabulation.tables:
-            law = mesh.law(name)
+            law = mesh.distribution(name)
             lead = law.batch_shape[1 : 1 + len(mesh.axes)]
             weights = _summed_to(joint, (count, *lead))
             flat = torch.Size(lead).numel()
@@ -130,7 +132,7 @@ class Exact(Engine):
     def prepare(self) -> Exact:
         """Tabulate the laws for every action now, and return self."""
         spaces = [(name, self.model.space(name)) for name in self.model.action_names]
-        others = [name for name, _ in self.layout.keys if name not in dict(spaces)]
+        others = [name for name, lag in self.layout.keys if lag or name not in dict(spaces)]
         if others or any(space.size is None for _, space in spaces):
             raise ValueOutOfRange(f"{type(self.model).__name__} has contexts that cannot be listed beforehand")
         if spaces:
@@ -167,6 +169,9 @@ class Exact(Engine):
     def know(self, belief: FiniteBelief, actions: Values) -> tuple[Values, Context]:
         """Move the known states on; return them and everything known by (name, lag)."""
         context: Context = {(name, 1): value for name, value in belief.known.items()}
+        for (name, _), value in context.items():
+            if value.is_floating_point() and bool(torch.isnan(value).any()):
+                raise ValueOutOfRange(f"{name} was missing a step ago, but a law asks for prev_{name}")
         context |= {(name, 0): value for name, value in actions.items()}
         count = len(belief.log_probs)
         known = {}
@@ -179,8 +184,20 @@ class Exact(Engine):
 
     def _kept(self, known: Values, seen: Values) -> Values:
         """What later steps ask for."""
-        now = {name: y.reshape(len(y), *self.structure.nodes[name].shape) for name, y in seen.items()}
+        now = {}
+        for name in set(seen) & set(self.layout.kept):
+            node, y = self.structure.nodes[name], seen[name]
+            y = y.reshape(len(y), *node.shape)
+            # Observations are held as floats; a law that indexes with one wants it back as it was.
+            whole = node.family == "Categorical" and not bool(torch.isnan(y).any())
+            now[name] = y.to(torch.int64) if whole else y
         return {name: (known | now)[name] for name in self.layout.kept}
+
+    def _first(self, mesh: Slice, name: str) -> Tensor:
+        before = self.laws.before(name)
+        if isinstance(before, Variable):
+            return mesh.value(before.name).reshape(mesh.value(before.name).shape[1 + len(mesh.axes) :])
+        return before
 
     def _before(self, mesh: Slice, axis: Axis) -> Tensor:
         if axis.name not in self.model.declaration.remembered:
@@ -197,14 +214,19 @@ class Exact(Engine):
         if not self.layout.states:
             return log_probs, None
         shift = torch.zeros(len(log_probs), dtype=self.dtype)
-        factors = [self._past(log_probs).exp()]
+        past = self._past(log_probs)
+        # Each combination of statics by itself, so that an unlikely one is not lost in single precision.
+        gone = tuple(range(1 + len(self.layout.statics), past.dim()))
+        top = past.amax(gone, keepdim=True).clamp(min=torch.finfo(self.dtype).min)
+        factors = [(past - top).exp()]
         for ratio in early:
             most = ratio.flatten(1).amax(1)
             factors.append((ratio - most.reshape(-1, *[1] * (ratio.dim() - 1))).exp())
             shift = shift + most
         factors += self.tabulation.transitions(rows)
         result = _contract(factors, len(self.layout.statics), len(self.layout.previous))
-        return result.log(), shift
+        top = top.reshape(*top.shape[: 1 + len(self.layout.statics)], *[1] * len(self.layout.states))
+        return result.log() + top, shift
 
     def _past(self, log_probs: Tensor) -> Tensor:
         """The belief with dimensions (B, statics, previous, 1 for each state now)."""
@@ -212,7 +234,7 @@ class Exact(Engine):
         first = 1 + len(self.layout.statics)
         gone = [first + i for i, axis in enumerate(self.layout.states) if axis.name not in kept]
         past = log_probs.logsumexp(gone) if gone else log_probs
-        return past.reshape(*past.shape, *[1] * len(self.layout.states))
+        return past.reshape(*past.shape, *[1] * len(self.layout.present))
 
     def joint(self, log_probs: Tensor, rows: Rows) -> Tensor:
         """p(statics, states before, states now), (B, statics, previous, states)."""

@@ -14,25 +14,23 @@ class FiniteTable(Table):
 
     stacked = ("index", "table", "baseline")
 
-    def __init__(self, index: Tensor | None, table: Tensor, baseline: Tensor | None, categorical: bool):
-        self.index, self.table, self.baseline, self.categorical = index, table, baseline, categorical
+    def __init__(self, index: Tensor | None, table: Tensor, baseline: Tensor | None):
+        self.index, self.table, self.baseline = index, table, baseline
         if index is None:
             self.stacked = ("table",)
 
     @classmethod
-    def of(
-        cls, index: Tensor | None, here: list[Tensor], baseline: list[Tensor] | None, categorical: bool
-    ) -> FiniteTable | None:
+    def of(cls, index: Tensor | None, here: list[Tensor], baseline: list[Tensor] | None) -> FiniteTable | None:
         """Make the table; None where the baseline excludes an outcome, for which no ratio exists."""
         table = here[0].log()
         if baseline is None:
-            return cls(None, table, None, categorical)
+            return cls(None, table, None)
         assert index is not None
         floor = baseline[0].log()
         if not torch.isfinite(floor).all():
             return None
         at = floor.gather(1, index.flatten(1)[..., None].expand(-1, -1, floor.shape[-1])).reshape(table.shape)
-        return cls(index, table - at, floor, categorical)
+        return cls(index, table - at, floor)
 
     def ratio(self, rows: Rows, y: Tensor) -> Tensor:
         """Return log p(y | h) - log p(y | baseline), (B, H)."""

@@ -46,14 +46,14 @@ class GaussianTable(Table):
             return linear - torch.einsum("be,bhe->bh", here, slope * offset)
         at = y.gather(1, self.flat_index[rows])
         scores = (at - self.flat_middle[rows]) * self.flat_slope[rows]
-        return summed(scores.nan_to_num(0.0), self.hypotheses)
+        return summed(scores.nan_to_num(0.0, torch.inf, -torch.inf), self.hypotheses)
 
     def base(self, rows: Rows, y: Tensor) -> Tensor:
         """Return log p(y | baseline), (B,)."""
         scale = self.scale[rows]
         standardised = (y - self.location[rows]) / scale
         scores = -0.5 * standardised * standardised - scale.log() - 0.9189385332046727
-        return scores.nan_to_num(0.0).sum(-1)
+        return scores.nan_to_num(0.0, torch.inf, -torch.inf).sum(-1)
 
     def sample(self, rows: Tensor, chosen: Tensor, seed: int) -> Tensor:
         """Draw y (R, S, elements), with common random numbers."""

@@ -7,10 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from apmodels import ValueOutOfRange
-from apmodels.distributions import base_of, picked, tensors, with_tensors
+from apmodels import Planted, ValueOutOfRange
+from apmodels.distributions import base_of, family, log_prob_of, picked, tensors, unvalidated, with_tensors
 from apmodels.simulation import seeded
-from inference.table import Rows, Table
+from inference.table import Misfit, Rows, Table
 
 
 class GenericTable(Table):
@@ -21,23 +21,34 @@ class GenericTable(Table):
 
     def append(self, other: Table) -> None:
         """Add the contexts of another table of the same observation."""
-        assert isinstance(other, GenericTable)
+        if not isinstance(other, GenericTable):
+            raise Misfit
         parts = [torch.cat(pair) for pair in zip(tensors(self.law), tensors(other.law), strict=True)]
         self.law = with_tensors(self.law, parts, parts[0].shape[:2], 2)
 
+    def read(self, y: Tensor, name: str) -> Tensor:
+        """Return y; ValueOutOfRange where it is infinite, or no count where counts are seen."""
+        y = super().read(y, name)
+        base, _ = base_of(self.law)
+        base = base.here if isinstance(base, Planted) else base
+        if len(base.event_shape) or not base.support.is_discrete:  # type: ignore[union-attr]
+            return y
+        wrong = ~torch.isnan(y) & ((y < 0) | (y != y.round()))
+        if bool(wrong.any()):
+            value = y[wrong][0].item()
+            raise ValueOutOfRange(f"{name} is {value:g} in some element; it must be a whole number from 0 up")
+        return y
+
     def ratio(self, rows: Rows, y: Tensor) -> Tensor:
         """Return log p(y | h), (B, H)."""
-        base, _ = base_of(picked(self.law, rows, (len(y), self.hypotheses), 2))
+        law = picked(self.law, rows, (len(y), self.hypotheses), 2)
         y = y.reshape(len(y), 1, *self.event_shape)
-        missing = torch.isnan(y) if y.is_floating_point() else torch.zeros_like(y, dtype=torch.bool)
-        if not len(base.event_shape):
-            scores = torch.where(missing, 0.0, base.log_prob(torch.where(missing, 1.0, y).to(y.dtype)))
-            return scores.reshape(*scores.shape[:2], -1).sum(-1)
-        gone = missing.reshape(len(y), -1)
-        if not bool((gone.all(-1) == gone.any(-1)).all()):
-            raise ValueOutOfRange(f"elements of a {type(base).__name__} cannot be missing one by one")
-        scores = base.log_prob(torch.where(missing, 0.0, y).to(y.dtype))
-        return torch.where(gone.any(-1, keepdim=True), 0.0, scores.reshape(*scores.shape[:2], -1).sum(-1))
+        if base_of(law)[0].event_shape and not isinstance(base_of(law)[0], Planted):
+            missing = torch.isnan(y).flatten(2)
+            if not torch.equal(missing.all(-1), missing.any(-1)):
+                raise ValueOutOfRange(f"elements of a {family(law)} cannot be missing one by one")
+        with unvalidated():
+            return log_prob_of(law, y.expand(len(y), self.hypotheses, *self.event_shape))
 
     def sample(self, rows: Tensor, chosen: Tensor, seed: int) -> Tensor:
         """Draw y (R, S, elements); every context draws from the same seed."""

@@ -42,7 +42,12 @@ def _choices(engine: Any, actions: Any) -> Values:
         if space.size is None:
             raise ValueOutOfRange(f"{names[0]} is a continuum; pass the actions to be compared")
         return {names[0]: space.values()}
-    return check_actions(engine.model, as_dict(actions, names, "action"))
+    checked = check_actions(engine.model, as_dict(actions, names, "action"))
+    for name, value in checked.items():
+        shape = engine.spaces[name].shape
+        if value.dim() != 1 + len(shape):
+            raise ValueOutOfRange(f"{name} to be compared has shape {tuple(value.shape)}; K actions are (K, *{shape})")
+    return checked
 
 
 class _Imagination:
@@ -88,9 +93,11 @@ class _Imagination:
 
     def _drawn(self, samples: int, seed: int) -> Values:
         """Imagined observations, (R, samples, elements) by name: worlds at even steps of the belief, then noise."""
-        weights = self.logs.flatten(1).exp()
+        weights = self.logs.reshape(len(self.logs), -1).exp()
         cumulative = weights.cumsum(1)
-        even = (torch.arange(samples, dtype=weights.dtype) + 0.5) / samples
+        # Even steps from a random start: unbiased, and far less noisy than independent draws.
+        start = torch.rand((), generator=torch.Generator().manual_seed(seed), dtype=weights.dtype)
+        even = (torch.arange(samples, dtype=weights.dtype) + start) / samples
         worlds = torch.searchsorted(cumulative, even * cumulative[:, -1:]).clamp(max=weights.shape[1] - 1)
         drawn = {}
         for i, (name, table) in enumerate(self.engine.tabulation.tables.items()):
@@ -108,14 +115,15 @@ class _Imagination:
             rows = self.rows.repeat_interleave(y.shape[1])
             ratio = table.ratio(rows, y.flatten(0, 1))
             if exact:
-                ratio = ratio + table.base(rows, y.flatten(0, 1))[:, None]
+                base = table.base(rows, y.flatten(0, 1))
+                ratio = ratio + (base[:, None] if isinstance(base, Tensor) else base)
             logs = logs + ratio.reshape(*y.shape[:2], *self.engine.tabulation.shapes[name])
         return logs
 
     def _total(self, logs: Tensor) -> Tensor:
-        return logs.flatten(2).logsumexp(2)
+        return logs.reshape(*logs.shape[:2], -1).logsumexp(2)
 
     def _entropy(self, logs: Tensor) -> Tensor:
         """The entropy of the interest now, (N,), from normalised log weights (N, *mesh)."""
         present = logs.logsumexp(tuple(self.past)) if len(self.past) else logs
-        return self.engine.projections.entropy(present, self.engine.names(None))
+        return self.engine.projections.entropy(self.engine.layout.padded(present), self.engine.names(None))

@@ -25,6 +25,8 @@ class Projections:
 
     def marginal(self, log_probs: Tensor, names: tuple[str, ...]) -> tuple[dict[str, Tensor], Tensor]:
         """Return name -> values (n, *shape) of the joint outcomes, and their log probabilities (B, n)."""
+        if not names:
+            return {}, log_probs.reshape(len(log_probs), -1).logsumexp(1, keepdim=True)
         if names not in self.plans:
             self.plans[names] = self._plan(names)
         values, dims, groups = self.plans[names]

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from pyro.distributions import Delta
 from torch import Tensor
 from torch.distributions import Distribution
 
@@ -62,6 +63,8 @@ class Slice:
     def value(self, name: str, lag: int = 0) -> Tensor:
         """Return the values of a variable on the mesh, (K or 1, sizes or 1, *shape)."""
         if (name, lag) not in self.memo:
+            if lag or self.laws.variables[name].role in ("action", "observation"):
+                raise KeyError(name)
             law = self.law(name)
             if not isinstance(law, Tensor):
                 raise ValueOutOfRange(f"{name} has no axis and is random")
@@ -76,6 +79,14 @@ class Slice:
         leads = [value.shape[:dims] for value in parents.values()] or [torch.Size((1,) * dims)]
         return self.laws.many(name, parents, tuple(torch.broadcast_shapes(*leads)))
 
+    def distribution(self, name: str) -> Any:
+        """Return an observation's law; a deterministic one as the distribution that has no noise."""
+        law = self.law(name)
+        if not isinstance(law, Tensor):
+            return law
+        lead = 1 + len(self.axes)
+        return Delta(law.to(self.laws.dtype), event_dim=law.dim() - lead, validate_args=False)
+
     def transition(self, axis: Axis) -> Tensor:
         """Return log p(value | parents) of a hidden variable, with its own values along its own dimension."""
         law = self.law(axis.name)
@@ -83,7 +94,7 @@ class Slice:
             same = _equal(law, self.along(axis, axis.values), axis.values.dim() - 1)
             return same.to(self.laws.dtype).log()
         support = axis.values[: _own(law)]
-        scores = law.log_prob(self.along(axis, support))
+        scores = self._scores(law, axis, support)
         missing = axis.size - len(support)
         if missing:
             dim = self.dim[axis.name, axis.lag]
@@ -91,6 +102,16 @@ class Slice:
             shape[dim] = missing
             scores = torch.cat([scores, scores.new_full(shape, -torch.inf)], dim)
         return scores
+
+    def _scores(self, law: Any, axis: Axis, support: Tensor) -> Tensor:
+        """log p of an axis's own values, along its own dimension, in which what cannot be is minus infinity."""
+        dim = self.dim[axis.name, axis.lag]
+        kind = type(law).__name__
+        if kind not in ("Categorical", "Bernoulli"):
+            return law.log_prob(self.along(axis, support)).to(self.laws.dtype)
+        # Their own log_prob rounds a probability of 0 up.
+        probs = law.probs if kind == "Categorical" else torch.stack([1 - law.probs, law.probs], -1)
+        return probs.movedim(-1, dim).squeeze(dim + 1).log()
 
 
 def _own(law: Distribution) -> int:
@@ -116,12 +137,12 @@ def supports(laws: Laws, structure: Structure) -> dict[str, Tensor]:
     found: dict[str, Tensor] = {}
     for node in structure.planned("enumerated"):
         if node.values is not None:
-            found[node.name] = node.values
+            found[node.name] = node.values.to(laws.dtype) if node.values.is_floating_point() else node.values
     for name in remembered:
         if name in found:
             before = laws.before(name)
-            if isinstance(before, Tensor):
-                found[name] = _union(found[name], before[None].to(found[name].dtype))
+            first = _first(laws, name, found) if isinstance(before, Variable) else before[None]
+            found[name] = _union(found[name], first)
     searched = [n.name for n in structure.planned("enumerated", "known") if _needs_search(n, remembered)]
     if any(structure.nodes[name].plan == "enumerated" for name in searched):
         reached = _reach(laws, structure, found, searched)
@@ -157,7 +178,11 @@ def _reach(laws: Laws, structure: Structure, fixed: dict[str, Tensor], searched:
 
 def _first(laws: Laws, name: str, fixed: dict[str, Tensor]) -> Tensor:
     before = laws.before(name)
-    return fixed[before.name] if isinstance(before, Variable) else before[None]
+    if not isinstance(before, Variable):
+        return before[None]
+    statics = [n for n in laws.model.declaration.names["static"] if n in fixed]
+    axes = [Axis(static, 0, fixed[static]) for static in statics]
+    return torch.unique(_rows(Slice(laws, axes, {}).value(before.name), 1 + len(axes)), dim=0)
 
 
 def _rows(values: Tensor, lead: int) -> Tensor:

@@ -26,26 +26,34 @@ from inference.table import Table
 SPARSE = 0.25
 
 
-def tabulate(law: Any, contexts: int, hypotheses: int, generic: bool = False) -> Table:
-    """Make the table of a law whose batch shape is (contexts, hypotheses); ``generic`` serves every family alike."""
-    base, added = base_of(law)
-    if generic:
-        parts = None
-    elif isinstance(base, Planted):
-        parts = _planted(base)
-    elif len(base.event_shape) == 0:
-        parts = _elementwise(base, added, contexts, hypotheses)
-    else:
-        parts = None
-    name = type(base.here if isinstance(base, Planted) else base).__name__
+# Kinds of table, from what a model's structure allows at best to what serves every law.
+SPARSE_LEVEL, DENSE_LEVEL, GENERIC_LEVEL = range(3)
+
+
+def tabulate(law: Any, contexts: int, hypotheses: int, level: int = SPARSE_LEVEL) -> Table:
+    """Make the table of a law whose batch shape is (contexts, hypotheses); a higher level serves more laws."""
     table: Table | None = None
-    if parts is not None and name == "Normal":
-        table = GaussianTable.of(*parts)
-    elif parts is not None and name in ("Categorical", "Bernoulli"):
-        table = FiniteTable.of(*parts, categorical=name == "Categorical")
-    table = table or GenericTable(law)
+    while table is None:
+        table = _of_level(law, contexts, hypotheses, level)
+        level += 1
     table.event_shape, table.hypotheses = law.event_shape, hypotheses
     return table
+
+
+def _of_level(law: Any, contexts: int, hypotheses: int, level: int) -> Table | None:
+    """A table, or None where the level is too low for the law."""
+    base, _ = base_of(law)
+    planted = isinstance(base, Planted)
+    name = type(base.here if planted else base).__name__
+    if level == GENERIC_LEVEL or name not in ("Normal", "Categorical", "Bernoulli"):
+        return GenericTable(law)
+    if planted:
+        parts = _planted(base) if level == SPARSE_LEVEL else _dense_planted(base)
+    else:
+        parts = _elementwise(base, contexts, hypotheses, level)
+    if parts is None:
+        return None
+    return GaussianTable.of(*parts) if name == "Normal" else FiniteTable.of(*parts)
 
 
 Parts = tuple[Tensor | None, list[Tensor], list[Tensor] | None]
@@ -57,35 +65,42 @@ def _family_parameters(base: Any) -> list[Tensor]:
         return [base.loc[..., None], base.scale[..., None]]
     if type(base).__name__ == "Bernoulli":
         return [torch.stack([1 - base.probs, base.probs], -1)]
-    return [base.probs] if type(base).__name__ == "Categorical" else []
+    return [base.probs]
 
 
-def _planted(law: Planted) -> Parts:
+def _planted(law: Planted) -> Parts | None:
     """Index (K, H, 1), parameters there (K, H, 1, P), and elsewhere (K, E, P)."""
     here = [p.unsqueeze(2) for p in _family_parameters(law.here)]
-    # What is planted does not change what is elsewhere; if it does, the law is as good as dense.
     elsewhere = [compact(p) for p in _family_parameters(law.elsewhere)]
+    # What is planted does not change what is elsewhere; if it does, the law is as good as dense.
     if any(p.shape[1] != 1 for p in elsewhere):
-        index = law.index[..., None, None]
-        dense = [
-            e.expand(*law.index.shape, *e.shape[2:]).scatter(2, index.expand(*h.shape), h)
-            for e, h in zip(_family_parameters(law.elsewhere), here, strict=True)
-        ]
-        return None, dense, None
-    shape = (len(law.index), *elsewhere[0].shape[2:3])
+        return None
+    shape = (len(law.index), elsewhere[0].shape[2])
     return law.index[..., None], here, [p[:, 0].expand(*shape, p.shape[-1]) for p in elsewhere]
 
 
-def _elementwise(base: Any, added: int, contexts: int, hypotheses: int) -> Parts:
-    """Index, parameters there and baseline of a dense law if most elements are alike, else (None, dense, None)."""
+def _dense_planted(law: Planted) -> Parts:
+    index = law.index[..., None, None]
+    here = [p.unsqueeze(2) for p in _family_parameters(law.here)]
+    dense = []
+    for p, other in zip(here, _family_parameters(law.elsewhere), strict=True):
+        wide = other.expand(*law.index.shape, *other.shape[2:])
+        dense.append(wide.scatter(2, index.expand(*p.shape), p))
+    return None, dense, None
+
+
+def _elementwise(base: Any, contexts: int, hypotheses: int, level: int) -> Parts | None:
+    """Index, parameters there and baseline of a law most of whose elements are alike; or (None, all of them, None)."""
     dense = [p.reshape(contexts, hypotheses, -1, p.shape[-1]) for p in _family_parameters(base)]
-    if not dense or hypotheses < 3 or dense[0].shape[2] < 2:
+    if level == DENSE_LEVEL:
         return None, dense, None
+    if hypotheses < 3 or dense[0].shape[2] < 2:
+        return None
     baseline = _baseline(dense)
     differs = torch.stack([(p != b[:, None]).any(-1) for p, b in zip(dense, baseline, strict=True)]).any(0)
     most = int(differs.sum(-1).max())
     if most > SPARSE * differs.shape[-1]:
-        return None, dense, None
+        return None
     index = _positions(differs, max(most, 1))
     here = [p.gather(2, index[..., None].expand(*index.shape, p.shape[-1])) for p in dense]
     return index, here, baseline

@@ -29,7 +29,7 @@ class Tabulation:
         self.laws = laws
         self.layout = layout
         self.names: list[str] = laws.model.observation_names
-        self.generic = False
+        self.level = 0
         self.contexts = Contexts(layout.keys, self._tabulate, self._forget)
 
     def rows(self, context: Context, count: int) -> Rows:
@@ -45,9 +45,13 @@ class Tabulation:
             return self.contexts.rows(context)
         except Misfit:
             # Some later context has another structure than the first: begin again, with what serves them all.
-            self.generic = True
+            self.level += 1
             self.contexts.clear()
-            return self.contexts.rows(context)
+            return self.find(context)
+        except Exception:
+            # A law that failed half way may have left half a table.
+            self.contexts.clear()
+            raise
 
     def is_late(self, name: str) -> bool:
         """Tell whether an observation depends on the present alone, and not on how it came about."""
@@ -55,7 +59,7 @@ class Tabulation:
 
     def transitions(self, rows: Rows) -> list[Tensor]:
         """Return p(value | parents) of each state, in a step's axes, (B or 1, sizes or 1)."""
-        pairs = zip(self.layout.states, self._transitions, strict=True)
+        pairs = zip(self.layout.present, self._transitions, strict=True)
         return [factor[rows] if self.layout.varies(axis.name) else factor for axis, factor in pairs]
 
     def _forget(self) -> None:
@@ -79,7 +83,7 @@ class Tabulation:
                 self._append_observation(mesh, name)
 
     def _append_transitions(self, mesh: Slice) -> None:
-        for i, axis in enumerate(self.layout.states):
+        for i, axis in enumerate(self.layout.present):
             new = mesh.transition(axis).exp()
             if self.layout.varies(axis.name):
                 new = new.expand(mesh.contexts, *new.shape[1:])
@@ -89,12 +93,12 @@ class Tabulation:
                 self._transitions[i] = torch.cat([self._transitions[i], new])
 
     def _append_observation(self, mesh: Slice, name: str) -> None:
-        law = mesh.law(name)
+        law = mesh.distribution(name)
         shape = tuple(law.batch_shape[1 : 1 + len(mesh.axes)])
         flat, contexts = torch.Size(shape).numel(), mesh.contexts
         parts = [p.expand(contexts, *p.shape[1:]) for p in tensors(law)]
         parts = [p.reshape(contexts, flat, *p.shape[1 + len(shape) :]) for p in parts]
-        table = tabulate(with_tensors(law, parts, (contexts, flat), 1 + len(shape)), contexts, flat, self.generic)
+        table = tabulate(with_tensors(law, parts, (contexts, flat), 1 + len(shape)), contexts, flat, self.level)
         if name in self.tables:
             self.tables[name].append(table)
         else:

@@ -154,7 +154,6 @@ def test_a_first_value_is_static(before):
     refused(f"begins as {before.name}", "@static", more=observation(lambda self, prev_level=before: None))
 
 
-@pytest.mark.xfail(strict=True, reason="the last of two contradicting first values wins in silence")
 def test_one_variable_has_one_first_value():
     refused("prev_level", shine=observation(lambda self, level, prev_level=5.0: None))
 
@@ -236,13 +235,11 @@ def test_reserved_names(name):
     refused(f"Bad.{name}", "choose another name", **{name: action(Binary())})
 
 
-@pytest.mark.xfail(strict=True, reason="only what is in vars(Model) is reserved, and the declaration is not")
 def test_declaration_is_reserved():
     shine = observation(lambda self, declaration, level, side: Normal(declaration, 1.0))
     refused("Bad.declaration", declaration=static(lambda self: Bernoulli(0.5)), shine=shine)
 
 
-@pytest.mark.xfail(strict=True, reason="a field may hide what every model has, and then it fails far away")
 @pytest.mark.parametrize("name", ["space", "structure", "simulate"])
 def test_reserved_names_of_fields(name):
     refused(f"Bad.{name}", **{name: Grid(2, 2), "__annotations__": {name: Grid}})
@@ -257,12 +254,10 @@ def test_pins_have_a_known_kind():
         observation(kinds={"side": "linear"})(lambda self, side: None)
 
 
-@pytest.mark.xfail(strict=True, reason="a pin for something that is no parent is ignored in silence")
 def test_a_pin_is_for_a_parent():
     refused("sde", shine=observation(kinds={"sde": "affine"})(lambda self, side, level: Normal(side + level, 1.0)))
 
 
-@pytest.mark.xfail(strict=True, reason="what is no space is accepted, and fails in simulate with an AttributeError")
 @pytest.mark.parametrize("space", [5, Binary, None])
 def test_an_action_has_a_space(space):
     refused("Bad.push", "space", push=action(space))
@@ -383,7 +378,6 @@ def test_a_number_is_a_deterministic_tensor(value):
     assert declare(side=static(lambda self: value))().simulate(2, batch=3)["side"].tolist() == [value] * 3
 
 
-@pytest.mark.xfail(strict=True, reason="a whole first value makes the Normal's scale whole too: 0.5 becomes 0")
 def test_a_first_value_may_be_a_whole_number():
     walk = declare(RandomWalk, position=state(lambda self, prev_position=0: Normal(prev_position, 0.5)))
     assert walk().simulate(3, seed=0)["position"].dtype == torch.float32

@@ -1,4 +1,5 @@
 import pytest
+import torch
 
 import inference
 from inference import Exact, Refusal
@@ -12,8 +13,6 @@ def test_the_best_bid_is_chosen_and_built():
 
 
 def test_options_reach_the_engine():
-    import torch
-
     assert inference.choose(Coin(), dtype=torch.float64).dtype == torch.float64
     assert inference.choose(Coin()).dtype == torch.float32
 
@@ -34,6 +33,7 @@ def test_the_exact_engine_counts_what_it_enumerates():
 
 
 def test_where_none_can_serve_the_refusal_has_all_reasons(monkeypatch):
-    monkeypatch.setattr("inference.choose.ENGINES", [Exact])
-    with pytest.raises(Refusal, match="no engine can serve RandomWalk:\n.*Exact.*not enumerated"):
+    # The package's name for the function hides the module.
+    monkeypatch.setitem(inference.choose.__globals__, "ENGINES", [Exact])
+    with pytest.raises(Refusal, match=r"no engine can serve RandomWalk:\n.*Exact.*not enumerated"):
         inference.choose(RandomWalk())

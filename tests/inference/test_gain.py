@@ -12,7 +12,7 @@ from tests.models import Caller, Counter, Coupled, Dial, Door, Drift, Lamp, Seas
 
 
 def history(model, engine, steps=2, seed=0):
-    record = model.simulate(steps, seed=seed)
+    record = model.simulate(steps + 1, seed=seed)
     actions = [{n: record[n][t] for n in model.action_names} for t in range(steps)]
     seen = [{n: record[n][t] for n in model.observation_names} for t in range(steps)]
     belief = engine.start()
