@@ -99,6 +99,11 @@ def _check_parent(cls: type, variable: Variable, parent: Parent, found: dict[str
     if parent.name not in found:
         if parent.name in getattr(cls, "__dataclass_fields__", {}):
             raise DeclarationError(f"{where}: {parent.name} is a field, which is known; write self.{parent.name}")
+        if callable(getattr(cls, parent.name, None)):
+            raise DeclarationError(
+                f"{where} has a parent {parent.name}, which is a plain method; "
+                "write @static, @state or @observation above it"
+            )
         raise DeclarationError(
             f"{where} has an unknown parent {parent.argument}{nearest(parent.name, found)}; "
             "declare it, or write self. before it if it is a field"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from inspect import get_annotations
 from typing import Any, ClassVar, dataclass_transform
@@ -36,6 +37,7 @@ class Model:
         super().__init_subclass__(**kwargs)
         _reserve(cls)
         dataclasses.dataclass(frozen=True, eq=False, kw_only=True, repr=True)(cls)
+        cls.__init__ = _checking(cls.__init__)  # type: ignore[method-assign]
         if not abstract:
             cls.declaration = declarations.declare(cls)
 
@@ -137,6 +139,22 @@ class Model:
 
     def __hash__(self) -> int:
         return hash(type(self))
+
+
+def _checking(init: Any) -> Any:
+    """Wrap a dataclass's constructor, so that a misspelt or nameless parameter is told in the model's own words."""
+
+    @functools.wraps(init)
+    def checked(self: Any, *values: Any, **parameters: Any) -> None:
+        fields = [field.name for field in dataclasses.fields(self) if field.init]
+        if values:
+            raise ValueOutOfRange(f"{type(self).__name__} takes its parameters by name: {', '.join(fields)}")
+        for name in parameters:
+            if name not in fields:
+                raise ValueOutOfRange(f"{type(self).__name__} has no parameter {name}{nearest(name, fields)}")
+        init(self, **parameters)
+
+    return checked
 
 
 def _equal(a: Any, b: Any) -> bool:

@@ -116,7 +116,10 @@ def as_dict(values: Any, names: list[str], what: str) -> Values:
     return {names[0]: _as_tensor(values, f"{what} {names[0]}")}
 
 
-def _as_tensor(value: Any, what: str) -> Tensor:
+def _as_tensor(value: Any, what: str) -> Any:
+    # A name, of a finite space that has names, is for the space to read.
+    if isinstance(value, str):
+        return value
     try:
         return torch.as_tensor(value)
     except (TypeError, ValueError, RuntimeError):

@@ -9,7 +9,7 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from apmodels.errors import ValueOutOfRange
+from apmodels.errors import ValueOutOfRange, nearest
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,8 @@ class Finite(Space):
 
     def check(self, value: Any, name: str = "action") -> Tensor:
         """Return ``value`` as int64 (*batch,); ValueOutOfRange where it is not in the space."""
+        if isinstance(value, str):
+            return self._named(value, name)
         given = torch.as_tensor(value)
         if given.dim() == 0 and not given.dtype.is_floating_point and 0 <= int(given) < self.size:
             return given.to(torch.int64)
@@ -76,6 +78,12 @@ class Finite(Space):
         if low < 0 or high >= self.size:
             raise ValueOutOfRange(f"{name} is {int(low if low < 0 else high)}, outside {self}: 0 to {self.size - 1}")
         return whole
+
+    def _named(self, value: str, name: str) -> Tensor:
+        names = getattr(self, "names", ())
+        if value not in names:
+            raise ValueOutOfRange(f"{name} is {value!r}, which is no name of a value of {self}{nearest(value, names)}")
+        return torch.tensor(names.index(value))
 
 
 def _whole(given: Tensor, name: str, space: Space) -> Tensor:
@@ -116,6 +124,7 @@ class Grid(Space):
     values = Finite.values
     sample = Finite.sample
     check = Finite.check
+    _named = Finite._named
 
     def uniform(self) -> dist.Categorical:
         """Return the uniform distribution over cells."""

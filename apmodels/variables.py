@@ -72,7 +72,10 @@ class Variable:
         """The parents in the order of the law's arguments; empty for an action."""
         if self.law is None:
             return ()
-        arguments = list(inspect.signature(self.law).parameters.values())[1:]
+        arguments = list(inspect.signature(self.law).parameters.values())
+        if not arguments or arguments[0].name != "self":
+            raise DeclarationError(f"{self.owner}.{self.name}: the first argument of a law is self; its parents follow")
+        arguments = arguments[1:]
         return tuple(self._parent(argument) for argument in arguments)
 
     def _parent(self, argument: inspect.Parameter) -> Parent:

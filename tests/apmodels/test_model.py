@@ -460,7 +460,7 @@ def test_what_was_read_from_a_model_is_read_anew_for_another_value():
 
 
 def test_parameters_are_given_by_name():
-    with pytest.raises(TypeError, match="positional"):
+    with pytest.raises(ValueOutOfRange, match="by name: drift, noise"):
         RandomWalk(1.0)
 
 
