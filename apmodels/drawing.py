@@ -34,7 +34,7 @@ def draw(model: Any) -> str:
     height = max(y for _, y in places.values()) + RADIUS + 60
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.0f}" height="{height:.0f}" '
-        f'viewBox="0 0 {width:.0f} {height:.0f}" font-family="sans-serif" font-size="12">',
+        f'viewBox="0 0 {width:.0f} {height:.0f}" font-family="sans-serif" font-size="12" style="background:#ffffff">',
         f"<title>{html.escape(structure.model)}</title>",
         _markers(),
     ]

@@ -101,8 +101,9 @@ def as_dict(values: Any, names: list[str], what: str) -> Values:
         if values is not None and values != {}:
             raise ValueOutOfRange(f"this model has no {what}; pass None")
         return {}
-    if isinstance(values, Tensor) and len(names) == 1:
-        return {names[0]: values}
+    # The commonest cases first: looking whether a number is a mapping takes longer than a step of the loop may.
+    if len(names) == 1 and isinstance(values, (Tensor, int, float)):
+        return {names[0]: torch.as_tensor(values)}
     if isinstance(values, Mapping):
         unknown = [name for name in values if name not in names]
         missing = [name for name in names if name not in values]

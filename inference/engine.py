@@ -51,6 +51,7 @@ class Engine(ABC):
         self.laws = Laws(model, dtype)
         self.dtype = self.laws.dtype
         self.spaces = {name: model.space(name) for name in model.action_names}
+        self.labels = {name: f"{type(model).__name__}.{name}" for name in model.declaration.variables}
         self.shown = {name: self.structure.nodes[name].shape for name in model.observation_names}
 
     def __repr__(self) -> str:
@@ -116,7 +117,7 @@ class Engine(ABC):
         checked = {}
         for name, value in given.items():
             space = self.spaces[name]
-            value = space.check(value, f"{type(self.model).__name__}.{name}")
+            value = space.check(value, self.labels[name])
             value = value.to(self.dtype) if value.is_floating_point() else value
             checked[name] = self._batched(name, value, space.shape, batch)
         return checked
@@ -134,7 +135,7 @@ class Engine(ABC):
             return value.unsqueeze(0) if batch == 1 else value.expand(batch, *shape)
         if tuple(value.shape) == (batch, *shape):
             return value
-        where = f"{type(self.model).__name__}.{name}"
+        where = self.labels[name]
         raise ValueOutOfRange(
             f"{where} has shape {tuple(value.shape)}; one value has shape {shape}, and this belief "
             + (f"holds {batch} of them" if batch > 1 else "holds one")

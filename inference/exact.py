@@ -81,10 +81,10 @@ class Exact(Engine):
         early: list[Tensor] = []
         late: list[Tensor] = []
         for name, table in self.tabulation.tables.items():
-            y = table.read(seen[name], f"{type(self.model).__name__}.{name}")
+            y = table.read(seen[name], self.labels[name])
             ratio = table.ratio(rows, y)
             evidence = evidence + table.base(rows, y)
-            if self.tabulation.is_late(name):
+            if name in self.tabulation.late:
                 late.append(ratio.reshape(count, *self.tabulation.now_shapes[name]))
             else:
                 early.append(ratio.reshape(count, *self.tabulation.shapes[name]))

@@ -60,7 +60,7 @@ class _Imagination:
         self.engine = engine
         self.rows = engine.tabulation.find(context).expand(len(rows))
         self.past = range(1 + len(engine.layout.statics), 1 + len(engine.layout.statics) + len(engine.layout.previous))
-        if all(engine.tabulation.is_late(name) for name in engine.tabulation.tables):
+        if engine.tabulation.late == set(engine.tabulation.tables):
             logs, _ = engine.predict(part.log_probs, self.rows, [])
             shape = logs.shape[: self.past.start] + (1,) * len(self.past) + logs.shape[self.past.start :]
             self.logs = logs.reshape(shape)
@@ -81,7 +81,9 @@ class _Imagination:
         # An outcome that cannot happen has no posterior, and no weight.
         normalised = after - self._total(after).clamp(min=-1e30).reshape(*after.shape[:2], *[1] * (after.dim() - 2))
         entropies = self._entropy(normalised.flatten(0, 1)).reshape(weights.shape)
-        return before - (weights * torch.where(weights > 0, entropies, 0.0)).sum(1)
+        gain = before - (weights * torch.where(weights > 0, entropies, 0.0)).sum(1)
+        # No information is negative; rounding, and few imagined observations, can make it seem so.
+        return gain.clamp(min=0)
 
     def _all(self, outcomes: dict[str, Tensor], counts: torch.Size) -> Values:
         """Every joint outcome, (R, outcomes, elements) by name."""

@@ -22,7 +22,8 @@ class Tabulation:
     """Tables that are made for a context when it is first met.
 
     ``tables`` are the observations', by name; ``shapes`` the sizes of their hypotheses in a step's axes, of which
-    those that an observation does not depend on are 1, and ``now_shapes`` the same without the past.
+    those that an observation does not depend on are 1, and ``now_shapes`` the same without the past. ``late`` are the
+    observations that depend on the present alone, and not on how it came about.
     """
 
     def __init__(self, laws: Laws, layout: Layout):
@@ -53,10 +54,6 @@ class Tabulation:
             self.contexts.clear()
             raise
 
-    def is_late(self, name: str) -> bool:
-        """Tell whether an observation depends on the present alone, and not on how it came about."""
-        return not self.layout.previous or all(n == 1 for n in self.layout.past(self.shapes[name]))
-
     def transitions(self, rows: Rows) -> list[Tensor]:
         """Return p(value | parents) of each state, in a step's axes, (B or 1, sizes or 1)."""
         pairs = zip(self.layout.present, self._transitions, strict=True)
@@ -66,6 +63,7 @@ class Tabulation:
         self.tables: dict[str, Table] = {}
         self.shapes: dict[str, tuple[int, ...]] = {}
         self.now_shapes: dict[str, tuple[int, ...]] = {}
+        self.late: set[str] = set()
         self._transitions: list[Tensor] = []
 
     def _tabulate(self, context: Context | None) -> None:
@@ -104,4 +102,6 @@ class Tabulation:
         else:
             self.tables[name], self.shapes[name] = table, shape
             self.now_shapes[name] = self.layout.without_past(shape)
+            if all(n == 1 for n in self.layout.past(shape)):
+                self.late.add(name)
         self.tables[name].settle()
