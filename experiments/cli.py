@@ -34,8 +34,8 @@ def main() -> None:
 def _quoted(word: str) -> str:
     """Quote the value of key=PATH where a path exists: Hydra's grammar stumbles over brackets and the like."""
     key, _, value = word.partition("=")
-    plain = all(c.isalnum() or c in "/._-~" for c in value)
-    if not value or plain or value[0] in "'\"" or not Path(value).exists():
+    plain = all(c.isalnum() or c in "/._-" for c in value)
+    if not value or plain or value[0] in "'\"" or not Path(value).expanduser().exists():
         return word
     escaped = value.replace("\\", "\\\\").replace("'", "\\'")
     return f"{key}='{escaped}'"

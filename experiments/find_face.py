@@ -32,7 +32,7 @@ def astronaut() -> np.ndarray:
 
 def find_face(config: Any, folder: Path, console: Console) -> Result:
     """Search one photograph with the eye and with the whole-image cascade; see ``conf/experiment/find_face.yaml``."""
-    photo = astronaut() if config.photo is None else read_photo(config.photo)
+    photo = astronaut() if config.photo is None else read_photo(str(config.photo))
     search = Search(config, photo, console)
     search.look()
     search.race()

@@ -38,8 +38,11 @@ class Result:
 def _whole(path: Path, write: Any) -> Path:
     # A run that is stopped half way leaves no half file behind.
     part = path.with_name(path.name + ".part")
-    write(part)
-    part.replace(path)
+    try:
+        write(part)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
     return path
 
 
