@@ -25,7 +25,7 @@ from typing import Any
 
 from torch import Tensor
 
-from apmodels.distributions import base_of, family
+from apmodels.distributions import family
 from apmodels.probing import Probe, support_of
 from apmodels.variables import Parent, Variable
 
@@ -229,8 +229,3 @@ def _with_befores(variable: Variable) -> list[Parent]:
         if isinstance(parent.before, Variable) and parent.before.name not in names:
             parents.append(Parent(parent.before.name))
     return parents
-
-
-def is_gaussian(law: Any) -> bool:
-    """Tell whether a law is Gaussian, elementwise or joint."""
-    return type(base_of(law)[0]).__name__ in GAUSSIAN

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import warnings
 from importlib import import_module
@@ -20,7 +21,13 @@ GROUPS = ("model", "engine", "controller", "body", "launcher")
 
 def main() -> None:
     """Run an experiment, a sweep (-m), or a tool."""
-    words = sys.argv[1:]
+    try:
+        _main(sys.argv[1:])
+    except KeyboardInterrupt:
+        fail("interrupted", 130)
+
+
+def _main(words: list[str]) -> None:
     if not words or (words[0] in ("-h", "--help") and len(words) == 1):
         print(usage())
         return
@@ -35,7 +42,7 @@ def _quoted(word: str) -> str:
     """Quote the value of key=PATH where a path exists: Hydra's grammar stumbles over brackets and the like."""
     key, _, value = word.partition("=")
     plain = all(c.isalnum() or c in "/._-" for c in value)
-    if not value or plain or value[0] in "'\"" or not Path(value).expanduser().exists():
+    if not value or plain or value[0] in "'\"" or not os.path.exists(os.path.expanduser(value)):
         return word
     escaped = value.replace("\\", "\\\\").replace("'", "\\'")
     return f"{key}='{escaped}'"
@@ -101,13 +108,12 @@ def run(config: Any) -> None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", category=FutureWarning)
             result = get_method(config.study)(config, folder, console)
-    except KeyboardInterrupt:
-        fail("interrupted", 130)
+        paths = result.write(folder)
     except (ValueError, OSError, TypeError) as error:
         if not _is_users(error):
             raise
         fail(str(error))
-    for path in result.write(folder):
+    for path in paths:
         console.print(f"wrote {_near(path)}", soft_wrap=True)
 
 

@@ -50,11 +50,14 @@ class Search:
         self.config, self.photo, self.console = config, photo, console
         self.model = instantiate(config.model)
         self.grid = self.model.grid
-        if not 0 < config.threshold <= 1 or config.fixations < 1:
+        numbers = isinstance(config.threshold, int | float) and isinstance(config.fixations, int)
+        if not numbers or not 0 < config.threshold <= 1 or config.fixations < 1:
             raise ValueOutOfRange(
                 "threshold must lie in (0, 1] and fixations be 1 or more, "
                 f"not {config.threshold} and {config.fixations}"
             )
+        if not isinstance(config.seed, int | None):
+            raise ValueOutOfRange(f"seed must be a whole number, not {config.seed}")
         self.eye: PhotoEye = instantiate(config.body)(photo=photo, grid=(self.grid.rows, self.grid.columns))
         # Tables and detectors are made once and serve any number of photographs: that is not search. Nor is the
         # first update, in which torch sets itself up.

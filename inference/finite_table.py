@@ -73,7 +73,11 @@ class FiniteTable(Table):
         if self.baseline is None:
             return _inverse(self.table[rows[:, None], chosen], uniform)
         assert self.index is not None
-        drawn = _inverse(self.baseline[rows][:, None], uniform)
+        cumulative = self.baseline[rows].exp().cumsum(-1)
+        # (R, elements, S): a search among an element's outcomes, instead of a comparison with each.
+        levels = uniform.T.expand(len(rows), -1, -1) * cumulative[..., -1:]
+        drawn = torch.searchsorted(cumulative, levels.contiguous()).clamp_(max=cumulative.shape[-1] - 1)
+        drawn = drawn.transpose(1, 2).contiguous()
         index = self.index[rows[:, None], chosen]
         floor = self.baseline[rows].gather(1, index.flatten(1)[..., None].expand(-1, -1, self.baseline.shape[-1]))
         here = self.table[rows[:, None], chosen] + floor.reshape(*index.shape, -1)
