@@ -47,9 +47,9 @@ class MostProbable(Controller):
         marginal = belief.marginal(self.interest)
         best, at = marginal.logits.topk(2 if marginal.logits.shape[-1] > 1 else 1)
         if belief.batch is None:
-            ends = best.tolist()
-            tied = len(marginal.values) > 1 and ends[0] - ends[-1] < TIE
-            return marginal.values[self._one_of(marginal.logits)[0] if tied else at[0]]
+            ends, where = best.tolist(), at.tolist()
+            tied = len(ends) > 1 and ends[0] - ends[-1] < TIE
+            return marginal.values[int(self._one_of(marginal.logits)) if tied else where[0]]
         tied = (best[..., 0] - best[..., -1]) < TIE
         if bool(tied.any()):
             at = torch.where(tied[..., None], self._one_of(marginal.logits), at)

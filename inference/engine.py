@@ -51,6 +51,10 @@ class Engine(ABC):
         self.laws = Laws(model, dtype)
         self.dtype = self.laws.dtype
         self.spaces = {name: model.space(name) for name in model.action_names}
+        # One whole number is the commonest action by far: it is made and checked once.
+        first = next(iter(self.spaces.values()), None)
+        few = first.values().tolist() if len(self.spaces) == 1 and first.size and first.size <= 4096 else []  # type: ignore[union-attr]
+        self._numbers = {n: {model.action_names[0]: torch.tensor([n])} for n in few}
         self.labels = {name: f"{type(model).__name__}.{name}" for name in model.declaration.variables}
         self.shown = {name: self.structure.nodes[name].shape for name in model.observation_names}
 
@@ -113,6 +117,8 @@ class Engine(ABC):
     # What users pass, checked and with a batch dimension.
 
     def _actions(self, action: Any, batch: int) -> Values:
+        if type(action) is int and batch == 1 and action in self._numbers:
+            return self._numbers[action]
         given = as_dict(action, self.model.action_names, "action")
         checked = {}
         for name, value in given.items():

@@ -77,26 +77,27 @@ class Exact(Engine):
         seen = self._observations(observation, count)
         known, context = self.know(belief, actions)
         rows = self.tabulation.rows(context, count)
-        evidence: Tensor | float = 0.0
+        evidence: Tensor | float | None = None
         early: list[Tensor] = []
         late: list[Tensor] = []
         for name, table in self.tabulation.tables.items():
             y = table.read(seen[name], self.labels[name])
-            ratio = table.ratio(rows, y)
-            evidence = evidence + table.base(rows, y)
+            ratio, base = table.score(rows, y)
+            evidence = base if evidence is None else evidence + base
             if name in self.tabulation.late:
-                late.append(ratio.reshape(count, *self.tabulation.now_shapes[name]))
+                late.append(_shaped(ratio, self.tabulation.now_shapes[name]))
             else:
-                early.append(ratio.reshape(count, *self.tabulation.shapes[name]))
+                early.append(_shaped(ratio, self.tabulation.shapes[name]))
         log_probs, shift = self.predict(belief.log_probs, rows, early)
-        weights = sum(late, start=log_probs).reshape(count, -1)
+        weights = sum(late, start=log_probs)
+        weights = weights if weights.dim() == 2 else weights.reshape(count, -1)
         log_probs = weights.log_softmax(1)
         # Normalising lowers every log weight by the log of their sum, the largest too.
         total = weights.amax(1) - log_probs.amax(1)
         if not math.isfinite(float(total if count == 1 else total.sum())):
             raise ValueOutOfRange(f"{type(self.model).__name__} gives what was observed no probability at all")
-        log_probs = self.layout.padded(log_probs.reshape(count, *self.layout.present_sizes))
-        evidence = total + evidence if shift is None else total + evidence + shift
+        log_probs = self.layout.padded(_shaped(log_probs, self.layout.present_sizes))
+        evidence = total + evidence if shift is None else total + evidence + shift  # type: ignore[operator]
         evidence = belief.log_evidence + (evidence[0] if belief.batch is None else evidence)
         kept = self._kept(known | actions, seen) if self.layout.kept else {}
         return FiniteBelief(self, belief.batch, belief.time + 1, evidence, kept, log_probs)
@@ -242,6 +243,11 @@ class Exact(Engine):
         for factor in self.tabulation.transitions(rows):
             joint = joint * factor
         return joint
+
+
+def _shaped(values: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """(B, H) as (B, *shape)."""
+    return values if len(shape) == 1 else values.reshape(len(values), *shape)
 
 
 def _single(belief: FiniteBelief, value: Tensor) -> Tensor:

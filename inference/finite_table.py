@@ -39,6 +39,22 @@ class FiniteTable(Table):
             return _outcome(table, y[:, None].expand(table.shape[:-1])).sum(-1)
         return summed(_outcome(self.flat_table[rows], y.gather(1, self.flat_index[rows])), self.hypotheses)
 
+    def settle(self) -> None:
+        """Lay out a sparse table's elements, and after them the baseline's, so that one gather scores both."""
+        super().settle()
+        if self.baseline is not None:
+            elements = torch.arange(self.baseline.shape[1]).expand(len(self.baseline), -1)
+            self.both_index = torch.cat([self.flat_index, elements], 1)
+            self.both_table = torch.cat([self.flat_table, self.baseline], 1)
+
+    def score(self, rows: Rows, y: Tensor) -> tuple[Tensor, Tensor | float]:
+        """Return ``ratio`` and ``base``."""
+        if self.baseline is None:
+            return super().score(rows, y)
+        scores = _outcome(self.both_table[rows], y.gather(1, self.both_index[rows]))
+        ratio, base = scores.split([self.flat_index.shape[1], y.shape[1]], 1)
+        return summed(ratio, self.hypotheses), base.sum(1)
+
     def read(self, y: Tensor, name: str) -> Tensor:
         """Return outcomes (B, elements) as int64, or as they are if some are missing."""
         last = self.table.shape[-1] - 1

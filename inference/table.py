@@ -60,6 +60,10 @@ class Table:
         """Return log p(y | baseline), (B,)."""
         return 0.0
 
+    def score(self, rows: Rows, y: Tensor) -> tuple[Tensor, Tensor | float]:
+        """Return ``ratio`` and ``base``."""
+        return self.ratio(rows, y), self.base(rows, y)
+
     def sample(self, rows: Tensor, chosen: Tensor, seed: int) -> Tensor:
         """Draw y (R, S, elements) under hypotheses chosen (R, S) in contexts rows (R,), with common random numbers."""
         raise NotImplementedError
