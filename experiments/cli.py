@@ -34,15 +34,20 @@ def _main(words: list[str]) -> None:
     if "=" not in words[0] and not words[0].startswith("-"):
         _run_tool(words[0], words[1:])
         return
-    sys.argv[1:] = [_quoted(word) for word in words]
+    sweeping = "-m" in words or "--multirun" in words
+    sys.argv[1:] = [_quoted(word, sweeping) for word in words]
     _hydra()
 
 
-def _quoted(word: str) -> str:
-    """Quote the value of key=PATH where a path exists: Hydra's grammar stumbles over brackets and the like."""
+def _quoted(word: str, sweeping: bool) -> str:
+    """Quote the value of key=PATH where a path exists: Hydra's grammar stumbles over brackets and the like.
+
+    A photo is a path even if there is none, but for a sweep, which is a list of them.
+    """
     key, _, value = word.partition("=")
     plain = all(c.isalnum() or c in "/._-" for c in value)
-    if not value or plain or value[0] in "'\"" or not os.path.exists(os.path.expanduser(value)):
+    is_path = (key == "photo" and not sweeping) or os.path.exists(os.path.expanduser(value))
+    if not value or plain or value[0] in "'\"" or not is_path:
         return word
     escaped = value.replace("\\", "\\\\").replace("'", "\\'")
     return f"{key}='{escaped}'"
@@ -100,6 +105,7 @@ def _hydra() -> None:
 def run(config: Any) -> None:
     """Run one configured study and write what it returns into Hydra's folder."""
     from hydra.core.hydra_config import HydraConfig
+    from hydra.errors import InstantiationException
     from hydra.utils import get_method
 
     folder = Path(HydraConfig.get().runtime.output_dir)
@@ -109,6 +115,9 @@ def run(config: Any) -> None:
             warnings.simplefilter("ignore", category=FutureWarning)
             result = get_method(config.study)(config, folder, console)
         paths = result.write(folder)
+    except InstantiationException as error:
+        # The whole message quotes the cause, and names the class and the key.
+        fail(str(error.__cause__ or error))
     except (ValueError, OSError, TypeError) as error:
         if not _is_users(error):
             raise

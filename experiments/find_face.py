@@ -14,10 +14,10 @@ from hydra.utils import instantiate
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from apmodels import ValueOutOfRange
+from apmodels import DetectorSearch, ValueOutOfRange
 from controllers import rollout
 from experiments.study import Result
-from hardware import PhotoEye, read_photo, whole_image
+from hardware import PhotoError, PhotoEye, read_photo, whole_image
 
 # The whole-image search takes about half a microsecond a pixel; from here on it is worth saying so.
 SLOW_PIXELS = 4_000_000
@@ -33,7 +33,11 @@ def astronaut() -> np.ndarray:
 def find_face(config: Any, folder: Path, console: Console) -> Result:
     """Search one photograph with the eye and with the whole-image cascade; see ``conf/experiment/find_face.yaml``."""
     photo = astronaut() if config.photo is None else read_photo(str(config.photo))
-    search = Search(config, photo, console)
+    try:
+        search = Search(config, photo, console)
+    except PhotoError as error:
+        # The eye was given pixels, and does not know where they came from.
+        raise PhotoError(str(error).replace("The photo", f"'{config.photo}'", 1)) from None
     search.look()
     search.race()
     summary = search.summary()
@@ -43,12 +47,26 @@ def find_face(config: Any, folder: Path, console: Console) -> Result:
     return Result(summary, {"find_face": search.data}, {"find_face": draw(search)})
 
 
+def _made(group: str, make: Any, *values: Any, **named: Any) -> Any:
+    """Make what a configuration group chose; what cannot be made here is the user's to choose otherwise."""
+    try:
+        return make(*values, **named)
+    except PhotoError:
+        raise
+    except (TypeError, ValueError) as error:
+        raise ValueOutOfRange(f"this {group} does not serve find_face: {error}") from error
+
+
 class Search:
     """One photograph, one eye, and what became of them."""
 
     def __init__(self, config: Any, photo: np.ndarray, console: Console):
         self.config, self.photo, self.console = config, photo, console
         self.model = instantiate(config.model)
+        if not isinstance(self.model, DetectorSearch):
+            raise ValueOutOfRange(
+                f"find_face counts a detector's boxes, which {type(self.model).__name__} knows nothing of"
+            )
         self.grid = self.model.grid
         numbers = isinstance(config.threshold, int | float) and isinstance(config.fixations, int)
         if not numbers or not 0 < config.threshold <= 1 or config.fixations < 1:
@@ -58,12 +76,13 @@ class Search:
             )
         if not isinstance(config.seed, int | None):
             raise ValueOutOfRange(f"seed must be a whole number, not {config.seed}")
-        self.eye: PhotoEye = instantiate(config.body)(photo=photo, grid=(self.grid.rows, self.grid.columns))
+        grid = (self.grid.rows, self.grid.columns)
+        self.eye: PhotoEye = _made("body", instantiate(config.body), photo=photo, grid=grid)
         # Tables and detectors are made once and serve any number of photographs: that is not search. Nor is the
         # first update, in which torch sets itself up.
         self.engine = instantiate(config.engine)(self.model).prepare()
         self.engine.update(self.engine.start(), 0, torch.zeros(self.grid.size)).most_probable()
-        self.controller = instantiate(config.controller)(self.engine)
+        self.controller = _made("controller", instantiate(config.controller), self.engine)
         self.box: np.ndarray | None = None
         self.closer = 0.0
         self.data = xr.Dataset()

@@ -58,9 +58,8 @@ class FiniteTable(Table):
     def read(self, y: Tensor, name: str) -> Tensor:
         """Return outcomes (B, elements) as int64, or as they are if some are missing."""
         last = self.table.shape[-1] - 1
-        outcomes = y.to(torch.int64).clamp_(0, last)
-        if torch.equal(outcomes.to(y.dtype), y):
-            return outcomes
+        if torch.equal(y.trunc().clamp_(0, last), y):
+            return y.long()
         wrong = ~(torch.isnan(y) | (y >= 0) & (y <= last) & (y == y.round()))
         if bool(wrong.any()):
             value = y[wrong][0].item()

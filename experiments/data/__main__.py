@@ -21,7 +21,7 @@ failed, 2 if a NAME is not in the table.
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; return its exit code."""
-    parser = argparse.ArgumentParser("python -m experiments.data", description=__doc__, epilog=_AFTERWORD)
+    parser = argparse.ArgumentParser("apmodels data", description=__doc__, epilog=_AFTERWORD)
     parser.add_argument("names", nargs="*", metavar="NAME", help="an entry of the table, as --list names it")
     parser.add_argument("--list", action="store_true", help="show the table and what has been fetched, and stop")
     options = parser.parse_args(arguments)

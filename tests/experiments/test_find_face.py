@@ -37,16 +37,17 @@ FACE = (114, 224)
 
 
 class Run:
-    """One run into a folder, and what it returned and left there."""
+    """One run into a folder, and what it returned and left there; the picture, which takes a second, if asked for."""
 
-    def __init__(self, folder, *overrides, photo=None):
+    def __init__(self, folder, *overrides, photo=None, picture=False):
         with initialize_config_module("conf", version_base="1.3"):
             config = compose("config", ["experiment=find_face", *overrides])
         config.photo = photo
         said = io.StringIO()
         try:
             self.result = find_face(config, folder, Console(file=said))
-            self.paths = self.result.write(folder)
+            figures = self.result.figures if picture else {}
+            self.paths = Result(self.result.summary, self.result.datasets, figures).write(folder)
         finally:
             plt.close("all")
         self.said = said.getvalue()
@@ -66,7 +67,7 @@ def photo(tmp_path_factory):
 
 
 def test_the_astronaut(tmp_path):
-    run = Run(tmp_path)
+    run = Run(tmp_path, picture=True)
     assert set(run.kept) >= PROMISED and list(run.kept) == list(run.summary)
     assert run.kept["found"] == 1 and 1 <= run.kept["fixations"] <= 30
     assert run.kept["distance_to_whole_image_cells"] <= 1 and 0.125 <= run.kept["belief"] <= 1
@@ -78,7 +79,7 @@ def test_the_astronaut(tmp_path):
 
 
 def test_what_is_kept_opens_again(tmp_path, photo):
-    run = Run(tmp_path, photo=photo)
+    run = Run(tmp_path, photo=photo, picture=True)
     with xr.open_dataset(tmp_path / "find_face.nc", engine="h5netcdf") as kept:
         assert kept.sizes["time"] == run.summary["fixations"] and kept.sizes["episode"] == 1
         last = kept["marginal"].values[0, -1]
@@ -194,9 +195,10 @@ KINDS = {
     "turned-left.jpg": lambda path: _turned(path, 8, 270),
     "photo": lambda path: save(path, astronaut(), format="PNG"),
 }
+RARE = ("cmyk.jpg", "upside-down.jpg", "turned-left.jpg", "photo")
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", [pytest.param(k, marks=pytest.mark.slow) if k in RARE else k for k in KINDS])
 def test_photos_of_every_kind(tmp_path, name):
     KINDS[name](tmp_path / name)
     run = Run(tmp_path, photo=tmp_path / name)
@@ -205,7 +207,7 @@ def test_photos_of_every_kind(tmp_path, name):
     assert np.hypot(seen[0] - FACE[0], seen[1] - FACE[1]) < 1.5 * 512 / 21
 
 
-@pytest.mark.parametrize("top", [0, 444, 888])
+@pytest.mark.parametrize("top", [0, 888])
 def test_a_portrait_shaped_photo(tmp_path, top):
     tall = np.zeros((1400, 512, 3), np.uint8)
     tall[top : top + 512] = astronaut()
@@ -219,7 +221,7 @@ def test_no_face(tmp_path, scene):
     run = Run(tmp_path, photo=save(tmp_path / "scene.png", scene()))
     assert run.kept["found"] == 0 and run.kept["fixations"] == len(run.fixations)
     assert [run.kept[name] for name in ("row", "column", "distance_to_whole_image_cells")] == [None] * 3
-    assert "no face found" in run.said and (tmp_path / "find_face.png").exists()
+    assert "no face found" in run.said
 
 
 def test_the_eye_and_the_whole_image_may_disagree(tmp_path, photo):
@@ -243,7 +245,7 @@ def test_scenes_without_people(tmp_path):
 def test_a_hundred_megapixels(tmp_path):
     large = np.full((10_000, 10_000, 3), 128, np.uint8)
     large[2000:3024, 3000:4024] = cv2.resize(astronaut(), (1024, 1024))
-    run = Run(tmp_path, photo=save(tmp_path / "large.jpg", large))
+    run = Run(tmp_path, photo=save(tmp_path / "large.jpg", large), picture=True)
     assert run.summary["found"] == 1 and run.summary["distance_to_whole_image_cells"] <= 1
     with Image.open(tmp_path / "find_face.png") as figure:
         assert figure.width < 3000
