@@ -9,7 +9,7 @@ from benchmarks.timing import milliseconds
 from controllers import GreedyInfomax, MostProbable
 from inference import Exact, tables
 
-SIDES = (7, 11, 21, 31)
+SIDES = (7, 11, 21, 31, 51)
 
 
 def measure() -> dict[str, float]:

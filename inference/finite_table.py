@@ -51,7 +51,12 @@ class FiniteTable(Table):
         """Return ``ratio`` and ``base``."""
         if self.baseline is None:
             return super().score(rows, y)
-        scores = _outcome(self.both_table[rows], y.gather(1, self.both_index[rows]))
+        at = y.gather(1, self.both_index[rows])
+        if isinstance(rows, slice) or at.is_floating_point():
+            scores = _outcome(self.both_table[rows], at)
+        else:
+            # Only the outcomes that were seen are read, not the table of every one of the batch.
+            scores = self.both_table[rows[:, None], torch.arange(at.shape[1]), at]
         ratio, base = scores.split([self.flat_index.shape[1], y.shape[1]], 1)
         return summed(ratio, self.hypotheses), base.sum(1)
 
