@@ -113,6 +113,9 @@ class Search:
 
     def race(self) -> None:
         """Search the whole image with the same kind of detector."""
+        self.rival, self.rival_milliseconds = None, float("nan")
+        if not self.config.whole_image:
+            return
         columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
         with Progress(
             *columns, transient=True, console=self.console, disable=self.photo[..., 0].size < SLOW_PIXELS
@@ -148,15 +151,16 @@ class Search:
             "whole_image_milliseconds": self.rival_milliseconds,
             "speedup": self.rival_milliseconds / self.milliseconds,
             "distance_to_whole_image_cells": float(distance),
-            "whole_image_found": int(self.rival is not None),
+            "whole_image_found": int(self.rival is not None) if self.config.whole_image else float("nan"),
         }
 
 
 def _tell(console: Console, summary: dict[str, Any]) -> None:
+    """Say in a line what was found, and how the race went if there was one."""
     found = f"a face at row {summary['row']}, column {summary['column']}" if summary["found"] else "no face found"
-    rival = "found one too" if summary["whole_image_found"] else "found none"
-    console.print(
-        f"{found}, after {summary['fixations']} fixations and {summary['milliseconds']:.1f} ms; the whole-image search "
-        f"{rival} in {summary['whole_image_milliseconds']:.0f} ms ({summary['speedup']:.1f} times as long)",
-        soft_wrap=True,
-    )
+    told = f"{found}, after {summary['fixations']} fixations and {summary['milliseconds']:.1f} ms"
+    if np.isfinite(summary["speedup"]):
+        rival = "found one" if summary["whole_image_found"] else "found none"
+        told += f"; the whole-image search {rival} in {summary['whole_image_milliseconds']:.0f} ms"
+        told += f" ({summary['speedup']:.1f} times as long)"
+    console.print(told, soft_wrap=True)

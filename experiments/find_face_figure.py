@@ -43,8 +43,8 @@ def draw(search: Any) -> Figure:
     right.imshow(_small(search.eye.reconstruct(last)), extent=extent, aspect=ratio)
     found = "found" if search.box is not None else "not found"
     figure.suptitle(
-        f"face {found}: {search.data.sizes['time']} fixations, {search.milliseconds:.0f} ms "
-        f"(whole image: {search.rival_milliseconds:.0f} ms)"
+        f"face {found}: {search.data.sizes['time']} fixations, {search.milliseconds:.0f} ms"
+        + (f" (whole image: {search.rival_milliseconds:.0f} ms)" if np.isfinite(search.rival_milliseconds) else "")
     )
     return figure
 

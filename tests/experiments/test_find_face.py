@@ -66,6 +66,13 @@ def photo(tmp_path_factory):
     return save(tmp_path_factory.mktemp("photos") / "astronaut.png", astronaut())
 
 
+def test_the_race_may_be_left_out(tmp_path, photo):
+    run = Run(tmp_path, "whole_image=false", photo=str(photo), picture=True)
+    assert run.kept["found"] == 1 and "whole-image" not in run.said
+    missing = {name for name, value in run.kept.items() if value is None}
+    assert missing == {name for name in run.kept if "whole_image" in name or name == "speedup"}
+
+
 def test_the_astronaut(tmp_path):
     run = Run(tmp_path, picture=True)
     assert set(run.kept) >= PROMISED and list(run.kept) == list(run.summary)
