@@ -39,7 +39,7 @@ def _main(words: list[str]) -> None:
     _hydra()
 
 
-def _quoted(word: str, sweeping: bool) -> str:
+def _quoted(word: str, sweeping: bool = False) -> str:
     """Quote the value of key=PATH where a path exists: Hydra's grammar stumbles over brackets and the like.
 
     A photo is a path even if there is none, but for a sweep, which is a list of them.

@@ -158,3 +158,8 @@ def test_hydra_reads_a_quoted_path_as_it_was(tmp_path, monkeypatch, name):
 )
 def test_what_is_no_path_is_left_alone(word):
     assert cli._quoted(word) == word
+
+
+def test_a_photo_that_is_not_there_is_quoted_unless_several_are_swept():
+    assert cli._quoted("photo=no[such](1).jpg") == "photo='no[such](1).jpg'"
+    assert cli._quoted("photo=a.jpg,b(1).jpg", sweeping=True) == "photo=a.jpg,b(1).jpg"
