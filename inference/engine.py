@@ -137,9 +137,9 @@ class Engine(ABC):
         return seen
 
     def _batched(self, name: str, value: Tensor, shape: tuple[int, ...], batch: int) -> Tensor:
-        if tuple(value.shape) == shape:
+        if value.shape == shape:
             return value.unsqueeze(0) if batch == 1 else value.expand(batch, *shape)
-        if tuple(value.shape) == (batch, *shape):
+        if value.shape == (batch, *shape):
             return value
         where = self.labels[name]
         raise ValueOutOfRange(

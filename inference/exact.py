@@ -35,6 +35,7 @@ class Exact(Engine):
 
     def __init__(self, model: Model, dtype: torch.dtype | None = None):
         super().__init__(model, dtype)
+        self.computed = [node.name for node in self.structure.planned("known")]
         self.layout = Layout(self.laws, self.structure)
         self.tabulation = Tabulation(self.laws, self.layout)
         self.projections = Projections(self.laws, self.structure, self.layout)
@@ -176,11 +177,11 @@ class Exact(Engine):
         context |= {(name, 0): value for name, value in actions.items()}
         count = len(belief.log_probs)
         known = {}
-        for node in self.structure.planned("known"):
-            parents = {p.argument: context[p.name, p.lag] for p in self.laws.variables[node.name].parents}
-            law = self.laws.many(node.name, parents, (count,))
+        for name in self.computed:
+            parents = {p.argument: context[p.name, p.lag] for p in self.laws.variables[name].parents}
+            law = self.laws.many(name, parents, (count,))
             assert isinstance(law, Tensor)
-            known[node.name] = context[node.name, 0] = law
+            known[name] = context[name, 0] = law
         return known, context
 
     def _kept(self, known: Values, seen: Values) -> Values:

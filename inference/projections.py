@@ -31,9 +31,10 @@ class Projections:
             self.plans[names] = self._plan(names)
         values, dims, groups = self.plans[names]
         if dims is not None:
+            if len(dims) == log_probs.dim() - 1:
+                return values, log_probs if log_probs.dim() == 2 else log_probs.flatten(1)
             gone = [d for d in range(1, log_probs.dim()) if d not in dims]
-            summed = log_probs.logsumexp(gone) if gone else log_probs
-            return values, summed.flatten(1)
+            return values, log_probs.logsumexp(gone).flatten(1)
         assert groups is not None
         probs = log_probs.flatten(1).exp()
         count = len(next(iter(values.values())))
