@@ -112,7 +112,7 @@ class Search:
         return repeated or self.box is not None
 
     def race(self) -> None:
-        """Search the whole image with the same kind of detector."""
+        """Search the whole image with the cascade at scale factor 1.1, whatever detector the eye has."""
         self.rival, self.rival_milliseconds = None, float("nan")
         if not self.config.whole_image:
             return
