@@ -58,7 +58,7 @@ def condition(
         kept = (~missing).to(noise.dtype)
         matrix = matrix * kept[..., None]
         noise = noise * kept[..., None] * kept[..., None, :] + torch.diag_embed(1 - kept)
-    seen = (~missing).sum(-1)
+    seen = (~missing).sum(-1).to(noise.dtype)
     cross = belief.covariance @ matrix.mT
     root, failed = torch.linalg.cholesky_ex(_symmetric(matrix @ cross + noise))
     if bool((failed != 0).any()):
