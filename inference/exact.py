@@ -18,9 +18,10 @@ from apmodels.variables import Variable
 from inference.beliefs import FiniteBelief, Marginal
 from inference.engine import Bid, Engine
 from inference.imagining import information_gain
+from inference.known import Known
 from inference.layout import Layout
 from inference.projections import Projections
-from inference.slices import Axis, Context, Slice
+from inference.slices import Axis, Context, Slice, contract
 from inference.table import Rows
 from inference.tabulation import Tabulation
 
@@ -35,7 +36,7 @@ class Exact(Engine):
 
     def __init__(self, model: Model, dtype: torch.dtype | None = None):
         super().__init__(model, dtype)
-        self.computed = [node.name for node in self.structure.planned("known")]
+        self.known = Known(self.laws, self.structure)
         self.layout = Layout(self.laws, self.structure)
         self.tabulation = Tabulation(self.laws, self.layout)
         self.projections = Projections(self.laws, self.structure, self.layout)
@@ -67,7 +68,7 @@ class Exact(Engine):
         for axis in self.layout.states:
             log_probs = log_probs + self._before(mesh, axis)
         log_probs = log_probs.expand(rows, *self.layout.sizes).contiguous()
-        known = {name: _rows(self._first(mesh, name), rows) for name in self.layout.kept}
+        known = self.known.first(rows)
         evidence = torch.zeros(() if batch is None else rows, dtype=self.dtype)
         return FiniteBelief(self, batch, 0, evidence, known, log_probs)
 
@@ -100,7 +101,7 @@ class Exact(Engine):
         log_probs = self.layout.padded(_shaped(log_probs, self.layout.present_sizes))
         evidence = total + evidence if shift is None else total + evidence + shift  # type: ignore[operator]
         evidence = belief.log_evidence + (evidence[0] if belief.batch is None else evidence)
-        kept = self._kept(known | actions, seen) if self.layout.kept else {}
+        kept = self.known.keep(known | actions, seen) if self.known.kept else {}
         return FiniteBelief(self, belief.batch, belief.time + 1, evidence, kept, log_probs)
 
     def forecast(self, belief: FiniteBelief, action: Any) -> Any:
@@ -170,36 +171,7 @@ class Exact(Engine):
 
     def know(self, belief: FiniteBelief, actions: Values) -> tuple[Values, Context]:
         """Move the known states on; return them and everything known by (name, lag)."""
-        context: Context = {(name, 1): value for name, value in belief.known.items()}
-        for (name, _), value in context.items():
-            if value.is_floating_point() and bool(torch.isnan(value).any()):
-                raise ValueOutOfRange(f"{name} was missing a step ago, but a law asks for prev_{name}")
-        context |= {(name, 0): value for name, value in actions.items()}
-        count = len(belief.log_probs)
-        known = {}
-        for name in self.computed:
-            parents = {p.argument: context[p.name, p.lag] for p in self.laws.variables[name].parents}
-            law = self.laws.many(name, parents, (count,))
-            assert isinstance(law, Tensor)
-            known[name] = context[name, 0] = law
-        return known, context
-
-    def _kept(self, known: Values, seen: Values) -> Values:
-        """What later steps ask for."""
-        now = {}
-        for name in set(seen) & set(self.layout.kept):
-            node, y = self.structure.nodes[name], seen[name]
-            y = y.reshape(len(y), *node.shape)
-            # Observations are held as floats; a law that indexes with one wants it back as it was.
-            whole = node.family == "Categorical" and not bool(torch.isnan(y).any())
-            now[name] = y.to(torch.int64) if whole else y
-        return {name: (known | now)[name] for name in self.layout.kept}
-
-    def _first(self, mesh: Slice, name: str) -> Tensor:
-        before = self.laws.before(name)
-        if isinstance(before, Variable):
-            return mesh.value(before.name).reshape(mesh.value(before.name).shape[1 + len(mesh.axes) :])
-        return before
+        return self.known.move(belief.known, actions, len(belief.log_probs))
 
     def _before(self, mesh: Slice, axis: Axis) -> Tensor:
         if axis.name not in self.model.declaration.remembered:
@@ -226,7 +198,7 @@ class Exact(Engine):
             factors.append((ratio - most.reshape(-1, *[1] * (ratio.dim() - 1))).exp())
             shift = shift + most
         factors += self.tabulation.transitions(rows)
-        result = _contract(factors, len(self.layout.statics), len(self.layout.previous))
+        result = contract(factors, len(self.layout.statics), len(self.layout.previous))
         top = top.reshape(*top.shape[: 1 + len(self.layout.statics)], *[1] * len(self.layout.states))
         return result.log() + top, shift
 
@@ -255,24 +227,6 @@ def _single(belief: FiniteBelief, value: Tensor) -> Tensor:
     return value[0] if belief.batch is None else value
 
 
-def _rows(value: Any, rows: int) -> Tensor:
-    return value.expand(rows, *value.shape)
-
-
 def _summed_to(joint: Tensor, shape: tuple[int, ...]) -> Tensor:
     dims = [i for i, (n, wanted) in enumerate(zip(joint.shape, shape, strict=True)) if n != wanted]
     return joint.sum(dims, keepdim=True) if dims else joint
-
-
-def _contract(factors: list[Tensor], statics: int, previous: int) -> Tensor:
-    """Multiply factors (B, statics, previous, states) and sum over the previous states."""
-    dims = list(range(factors[0].dim()))
-    operands: list[Any] = []
-    for factor in factors:
-        kept = [d for d in dims if factor.shape[d] > 1]
-        operands += [factor.reshape([factor.shape[d] for d in kept]), kept]
-    out = [d for d in dims if not 1 + statics <= d < 1 + statics + previous]
-    sizes = [max(factor.shape[d] for factor in factors) for d in out]
-    held = {d for subscripts in operands[1::2] for d in subscripts}
-    result = torch.einsum(*operands, [d for d in out if d in held])
-    return result.reshape(sizes)

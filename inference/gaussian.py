@@ -74,6 +74,11 @@ def condition(
 
 
 def _times(matrix: Tensor, vector: Tensor) -> Tensor:
+    if matrix.shape[:-2].numel() == 1:
+        # One matrix for all: one product, instead of one for each row.
+        wide = max(matrix.dim() - 1, vector.dim())
+        product = vector @ matrix.reshape(matrix.shape[-2:]).mT
+        return product.reshape((1,) * (wide - product.dim()) + product.shape)
     return (matrix @ vector[..., None])[..., 0]
 
 

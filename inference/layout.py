@@ -15,7 +15,7 @@ class Layout:
 
     A belief is an array over ``statics`` and ``states``; a step is an array over ``statics``, ``previous`` (the
     states that somebody remembers, a step ago) and ``present`` (the states now). ``keys`` are the contexts: what is
-    known and bears on what is hidden or seen. ``kept`` are the known variables that a later step asks for.
+    known and bears on what is hidden or seen.
     """
 
     def __init__(self, laws: Laws, structure: Structure):
@@ -27,7 +27,6 @@ class Layout:
         self.statics = [Axis(n.name, 0, values[n.name]) for n in hidden if n.role == "static"]
         self.states = [Axis(n.name, 0, values[n.name]) for n in hidden if n.role == "state"]
         self.previous = [Axis(axis.name, 1, axis.values) for axis in self.states if axis.name in remembered]
-        self.kept = [name for name in remembered if name not in values]
         # A state never comes back to a value that only its time before the first step had.
         self.present = [Axis(a.name, 0, a.values[: own.get(a.name, a.size)]) for a in self.states]
         self.axes = self.statics + self.states

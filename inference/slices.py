@@ -197,3 +197,17 @@ def _union(values: Tensor, more: Tensor) -> Tensor:
         return values
     new = torch.unique(new, dim=0)
     return torch.cat([values, new.reshape(-1, *values.shape[1:])])
+
+
+def contract(factors: list[Tensor], statics: int, previous: int) -> Tensor:
+    """Multiply factors (B, statics, previous, states) and sum over the previous states."""
+    dims = list(range(factors[0].dim()))
+    operands: list[Any] = []
+    for factor in factors:
+        kept = [d for d in dims if factor.shape[d] > 1]
+        operands += [factor.reshape([factor.shape[d] for d in kept]), kept]
+    out = [d for d in dims if not 1 + statics <= d < 1 + statics + previous]
+    sizes = [max(factor.shape[d] for factor in factors) for d in out]
+    held = {d for subscripts in operands[1::2] for d in subscripts}
+    result = torch.einsum(*operands, [d for d in out if d in held])
+    return result.reshape(sizes)

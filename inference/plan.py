@@ -1,0 +1,123 @@
+"""Which hidden variables get values, world by world, and which are summed or integrated given those.
+
+A world is one assignment of values to the variables that cannot be integrated: a hypothesis, or a particle. Given a
+world, what remains falls into groups that know nothing of each other, each with an algebra of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from apmodels.structure import Arrow, Node, Structure
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How the hidden variables of a structure are treated; names in the order in which they happen.
+
+    ``worlds`` are random and have a value in every world; ``computed`` follow from those and from what is known;
+    ``finite`` are summed, each group of ``gaussian`` is one joint Gaussian, each of ``fields`` a chain of images of
+    independent pixels, each of ``counted`` a set of Beta, Dirichlet or Gamma variables that share outcomes.
+    """
+
+    worlds: tuple[str, ...]
+    computed: tuple[str, ...]
+    finite: tuple[str, ...]
+    gaussian: tuple[tuple[str, ...], ...]
+    fields: tuple[tuple[str, ...], ...]
+    counted: tuple[tuple[str, ...], ...]
+
+    @property
+    def integrated(self) -> set[str]:
+        """The variables of all Gaussian, field and counted groups."""
+        return {name for group in (*self.gaussian, *self.fields, *self.counted) for name in group}
+
+
+def make_plan(structure: Structure, sampled: Iterable[str] = ()) -> Plan:
+    """Divide the hidden variables, where those ``sampled`` get values whatever could be done with them."""
+    return _Planner(structure, set(sampled)).plan()
+
+
+class _Planner:
+    def __init__(self, structure: Structure, forced: set[str]):
+        self.structure = structure
+        self.nodes = structure.nodes
+        self.hidden = {node.name for node in structure.hidden}
+        forced |= {node.name for node in structure.planned("sampled") if node.random}
+        self.algebra = {node.name for node in structure.planned("integrated", "counted")} - forced
+        self.finite = self._summable(forced)
+        self.worlds = {n.name for n in structure.hidden if n.random and n.name not in self.algebra | self.finite}
+        self.computed = self._computed()
+        self.finite -= self.computed
+        self.algebra -= self.computed
+
+    def plan(self) -> Plan:
+        counted = {name for name in self.algebra if self.nodes[name].plan == "counted"}
+        groups = self._groups(self.algebra - counted)
+        fields = tuple(group for group in groups if self._is_field(group))
+        return Plan(
+            self._ordered(self.worlds),
+            self._ordered(self.computed),
+            self._ordered(self.finite),
+            tuple(group for group in groups if group not in fields),
+            fields,
+            self._groups(counted),
+        )
+
+    def _ordered(self, names: set[str]) -> tuple[str, ...]:
+        return tuple(name for name in self.nodes if name in names)
+
+    def _summable(self, forced: set[str]) -> set[str]:
+        """The finite variables that touch, below them, nothing but each other and observations of the like."""
+        members = {node.name for node in self.structure.planned("enumerated")} - forced
+        while True:
+            kept = {name for name in members if self._stays(name, members)}
+            if kept == members:
+                return members
+            members = kept
+
+    def _stays(self, name: str, members: set[str]) -> bool:
+        for arrow in self.structure.out_of(name):
+            child = self.nodes[arrow.child]
+            mixed = any(other.parent in self.algebra for other in self.structure.into(child.name))
+            if (child.role == "observation" and mixed) or (child.role != "observation" and child.name not in members):
+                return False
+        return not any(arrow.parent in self.algebra for arrow in self.structure.into(name))
+
+    def _computed(self) -> set[str]:
+        members: set[str] = set()
+        for node in self.structure.hidden:
+            parents = {a.parent for a in self.structure.into(node.name) if a.parent in self.hidden}
+            if not node.random and parents - {node.name} <= self.worlds | members:
+                members.add(node.name)
+        return members
+
+    def _groups(self, names: set[str]) -> tuple[tuple[str, ...], ...]:
+        """Names that depend on each other, or are seen together, in one group."""
+        group = {name: {name} for name in names}
+        for child in self.nodes:
+            family = {arrow.parent for arrow in self.structure.into(child)} & names
+            family |= {child} & names
+            merged = set().union(*(group[name] for name in family)) if family else set()
+            for name in merged:
+                group[name] = merged
+        return tuple(dict.fromkeys(self._ordered(group[name]) for name in self._ordered(names)))
+
+    def _is_field(self, group: tuple[str, ...]) -> bool:
+        """Whether a group is one chain of images that are only ever moved, seen by moved observations."""
+        arrows = [arrow for name in group for arrow in self.structure.out_of(name)]
+        if not any(arrow.kind == "moves" for arrow in arrows):
+            return False
+        return (
+            all(self._moves(arrow, group) for arrow in arrows)
+            and all(self.nodes[name].family in ("Normal", "deterministic") for name in group)
+            and all(sum(a.child in group for a in self.structure.out_of(name)) <= 1 for name in group)
+        )
+
+    def _moves(self, arrow: Arrow, group: tuple[str, ...]) -> bool:
+        child: Node = self.nodes[arrow.child]
+        if child.role == "observation":
+            parents = [a for a in self.structure.into(child.name) if a.parent in group]
+            return arrow.kind == "moves" and not arrow.lag and child.family == "Normal" and len(parents) == 1
+        return arrow.kind == "moves" and child.name in group
