@@ -10,3 +10,7 @@ from inference.engine import Bid as Bid
 from inference.engine import Engine as Engine
 from inference.engine import Refusal as Refusal
 from inference.exact import Exact as Exact
+from inference.kalman import Kalman as Kalman
+from inference.particles import Particles as Particles
+from inference.rao_blackwell import DepletionWarning as DepletionWarning
+from inference.rao_blackwell import RaoBlackwell as RaoBlackwell

@@ -7,8 +7,11 @@ from typing import Any
 from apmodels import Model
 from inference.engine import Engine, Refusal
 from inference.exact import Exact
+from inference.kalman import Kalman
+from inference.particles import Particles
+from inference.rao_blackwell import RaoBlackwell
 
-ENGINES: list[type[Engine]] = [Exact]
+ENGINES: list[type[Engine]] = [Exact, Kalman, RaoBlackwell, Particles]
 
 
 def bids(model: Model) -> dict[str, Any]:

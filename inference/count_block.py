@@ -6,9 +6,11 @@ one selected. What is counted is then kept beside the prior's own pseudo-counts 
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
-from torch.distributions import Distribution
+from torch.distributions import Dirichlet, Gamma
 
 from apmodels.distributions import base_of, family
 from apmodels.laws import Laws
@@ -66,9 +68,9 @@ class CountBlock:
         """Draw the variables themselves, (*lead, *shape) by name."""
         counts = counts.expand(*lead, *counts.shape[2:])
         if self.kind == "Gamma":
-            drawn = torch._standard_gamma(counts[..., 0]) / counts[..., 1]
+            drawn = Gamma(counts[..., 0], counts[..., 1], validate_args=False).sample()
         else:
-            drawn = torch._sample_dirichlet(counts)
+            drawn = Dirichlet(counts, validate_args=False).sample()
             drawn = drawn[..., 1] if self.kind == "Beta" else drawn
         return {name: part.reshape(*lead, *self.shapes[name]) for name, part in self._split(drawn).items()}
 
@@ -152,7 +154,7 @@ def _probability(law) -> Tensor:
     return values.reshape(*values.shape[:3], -1, row).double()
 
 
-def _pseudo_counts(law: Distribution, kind: str) -> Tensor:
+def _pseudo_counts(law: Any, kind: str) -> Tensor:
     """A prior's parameters, (b, n, components, outcomes)."""
     base, _ = base_of(law)
     lead = law.batch_shape[:2]

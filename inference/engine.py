@@ -114,6 +114,12 @@ class Engine(ABC):
             beliefs.append(belief)
         return beliefs
 
+    def names(self, names: str | tuple[str, ...] | None) -> tuple[str, ...]:
+        """Return variables' names as a tuple; the interest's where none are given."""
+        if names is None:
+            return ("interest",) if self.model.declaration.interest else self.structure.interest
+        return (names,) if isinstance(names, str) else tuple(names)
+
     # What users pass, checked and with a batch dimension.
 
     def _actions(self, action: Any, batch: int) -> Values:

@@ -34,6 +34,14 @@ class Exact(Engine):
     from the common baseline are never scored.
     """
 
+    def __new__(cls, model: Model, dtype: torch.dtype | None = None) -> Any:
+        """Make the engine; one that counts, where something is known by counting."""
+        from inference.counting import Counting
+
+        if cls is Exact and isinstance(model, Model) and Counting.bid(model.structure):
+            return Counting(model, dtype)
+        return super().__new__(cls)
+
     def __init__(self, model: Model, dtype: torch.dtype | None = None):
         super().__init__(model, dtype)
         self.known = Known(self.laws, self.structure)
@@ -43,7 +51,11 @@ class Exact(Engine):
 
     @classmethod
     def bid(cls, structure: Structure) -> Bid:
-        """Serve models whose hidden variables are all finite."""
+        """Serve models whose hidden variables are all finite, or known by counting."""
+        from inference.counting import Counting
+
+        if structure.planned("counted"):
+            return Counting.bid(structure)
         for node in structure.hidden:
             if node.plan != "enumerated":
                 return Bid(0.0, f"{node.name} is {node.plan}, not enumerated: {node.why}")
@@ -162,12 +174,6 @@ class Exact(Engine):
         return _single(belief, values[names[0]][log_probs.argmax(-1)])
 
     # Knowing and predicting.
-
-    def names(self, names: str | tuple[str, ...] | None) -> tuple[str, ...]:
-        """Return variables' names as a tuple; the interest's where none are given."""
-        if names is None:
-            return ("interest",) if self.model.declaration.interest else self.structure.interest
-        return (names,) if isinstance(names, str) else tuple(names)
 
     def know(self, belief: FiniteBelief, actions: Values) -> tuple[Values, Context]:
         """Move the known states on; return them and everything known by (name, lag)."""

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from apmodels.distributions import log_prob_of
+from apmodels.distributions import log_prob_of, picked, tensors, with_tensors
 from apmodels.laws import Laws
 from apmodels.structure import Structure
 from inference.frame import Frame, Key
@@ -60,7 +61,10 @@ class FiniteBlock:
 
     def step(self, logs: Tensor, frame: Frame, values: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Move on and condition on what is seen; return normalised log probabilities and the score, (b, n)."""
-        lead = logs.shape[:2]
+        lead = torch.broadcast_shapes(
+            logs.shape[:2], frame.lead(self.keys), *(values[name].shape[:2] for name in self.seen)
+        )
+        logs = logs.expand(*lead, *self.sizes)
         axes = self.statics + self.previous + self.states
         mesh = Slice(self.laws, axes, self._flat(frame, self.keys, lead))
         rows = lead[0] * lead[1]
@@ -80,6 +84,46 @@ class FiniteBlock:
         total = joint.flatten(1).sum(1)
         logs = joint.log() - total.log().clamp(min=-1e30).reshape(-1, *[1] * (joint.dim() - 1))
         return logs.reshape(*lead, *self.sizes), (total.log() + shift).reshape(lead)
+
+    def imagine(self, logs: Tensor, frame: Frame, lead: tuple[int, int]) -> dict[str, Tensor]:
+        """Draw what would be seen after a step, (*lead, *shape) by name."""
+        rows = lead[0] * lead[1]
+        mesh, joint = self._joint(logs.expand(*lead, *self.sizes), frame)
+        flat = joint.expand(rows, *joint.shape[1:]).flatten(1)
+        cell = (flat.log() - torch.log(-torch.log(torch.rand(flat.shape, dtype=flat.dtype)))).argmax(1)
+        at = torch.unravel_index(cell, joint.shape[1:])
+        seen = {}
+        for name in self.seen:
+            law = mesh.distribution(name)
+            shape = law.batch_shape
+            index = [torch.arange(rows) if shape[0] > 1 else torch.zeros(rows, dtype=torch.int64)]
+            index += [i if size > 1 else torch.zeros_like(i) for i, size in zip(at, shape[1:], strict=True)]
+            drawn = picked(law, tuple(index), (rows,), len(shape)).sample()
+            seen[name] = drawn.reshape(*lead, *drawn.shape[1:]).to(self.laws.dtype)
+        return seen
+
+    def predicted(self, name: str, logs: Tensor, frame: Frame) -> tuple[Tensor, Any]:
+        """Return weights (rows, cells) of what could be so, and the law of what would be seen there."""
+        rows = logs.shape[0] * logs.shape[1]
+        mesh, joint = self._joint(logs, frame)
+        law = mesh.distribution(name)
+        gone = [d for d in range(1, joint.dim()) if law.batch_shape[d] == 1]
+        weights = joint.sum(gone, keepdim=True) if gone else joint
+        cells = weights.shape[1:].numel()
+        parts = [p.expand(rows, *p.shape[1:]) for p in tensors(law)]
+        parts = [p.reshape(rows, cells, *p.shape[joint.dim() :]) for p in parts]
+        return weights.expand(rows, *weights.shape[1:]).reshape(rows, cells), with_tensors(
+            law, parts, (rows, cells), joint.dim()
+        )
+
+    def _joint(self, logs: Tensor, frame: Frame) -> tuple[Slice, Tensor]:
+        """The mesh of a step, and p(statics, states before, states now) on it."""
+        lead = logs.shape[:2]
+        mesh = Slice(self.laws, self.statics + self.previous + self.states, self._flat(frame, self.keys, lead))
+        joint = self._past(logs.reshape(lead[0] * lead[1], *self.sizes)).exp()
+        for axis in self.states:
+            joint = joint * mesh.transition(axis).exp()
+        return mesh, joint
 
     def _past(self, logs: Tensor) -> Tensor:
         kept = {axis.name for axis in self.previous}

@@ -143,7 +143,8 @@ class GaussianBlock:
 
     def view(self, frame: Frame, at: str = "", birth: bool = False) -> tuple[Tensor, Tensor, Tensor]:
         """Return the matrix, offset and noise of what is drawn or seen at the end of a stage."""
-        return (self.births if birth else self.steps)[at].views(frame)
+        matrix, offset, noise = (self.births if birth else self.steps)[at].views(frame)
+        return matrix, offset, noise
 
     def leave(self, belief: Gaussian, birth: bool = False) -> Gaussian:
         """Drop what belongs to the step before."""

@@ -23,19 +23,20 @@ def information_gain(engine: Any, belief: Any, actions: Any, samples: int, seed:
     expectation is a sum over all of them; else an average over imagined ones, drawn with the same random numbers
     for every action, so that differences between actions are much surer than the gains themselves.
     """
-    acts = _choices(engine, actions)
-    choices = len(next(iter(acts.values()))) if acts else 1
+    acts = choices(engine, actions)
+    many = len(next(iter(acts.values()))) if acts else 1
     count = len(belief.log_probs)
     step = max(1, CHUNK // (max(samples, 1) * torch.Size(engine.layout.sizes).numel()))
     parts = []
-    for pairs in torch.arange(count * choices).split(step):
-        rows, chosen = pairs // choices, {name: values[pairs % choices] for name, values in acts.items()}
+    for pairs in torch.arange(count * many).split(step):
+        rows, chosen = pairs // many, {name: values[pairs % many] for name, values in acts.items()}
         parts.append(_Imagination(engine, belief, rows, chosen).gain(samples, seed))
-    gains = torch.cat(parts).reshape(count, choices)
+    gains = torch.cat(parts).reshape(count, many)
     return gains[0] if belief.batch is None else gains
 
 
-def _choices(engine: Any, actions: Any) -> Values:
+def choices(engine: Any, actions: Any) -> Values:
+    """Return the actions to be compared, (K, *shape) by name: those given, or all of a finite space."""
     names = engine.model.action_names
     if actions is None and len(names) == 1:
         space = engine.model.space(names[0])

@@ -27,7 +27,7 @@ from apmodels import (
 from apmodels.simulation import as_given
 from inference import Exact, Refusal
 from tests.inference.oracle import Oracle, plain
-from tests.models import Caller, Coin, Counter, Coupled, Dial, Door, Drift, Lamp, RandomWalk, Seasons, Twins
+from tests.models import Caller, Coin, Counter, Coupled, Dial, Door, Drift, Lamp, RandomWalk, Seasons, Twins, Weather
 
 NAN = float("nan")
 
@@ -418,7 +418,7 @@ class Trust(Model):
 @pytest.mark.parametrize(
     ("model", "words"),
     [
-        (Trust(), "rate is counted"),
+        (Weather(), "weather changes from step to step"),
         (RandomWalk(), "not enumerated"),
         (Listener(), "sound is an Evidence"),
         (Chain(), "second depends on first"),

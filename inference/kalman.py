@@ -1,0 +1,42 @@
+"""The Kalman filter, of any model that is affine and Gaussian given finite hypotheses (thesis eqs 6.17 to 6.29)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from apmodels import Model
+from apmodels.structure import Structure
+from inference.engine import Bid
+from inference.hypotheses import Hypotheses, hypotheses_plan
+from inference.plan import Plan
+
+
+class Kalman(Hypotheses):
+    """Integrates affine-Gaussian variables; one filter for each value of a static finite parent.
+
+    Laws may depend on actions and known states in any way; what they make of Gaussian parents is read as matrices, once
+    for each context. Covariances are in double precision and in Joseph's form, whatever ``dtype``. Fields of
+    independent pixels that are only moved are two images.
+
+    Args:
+        model: see Engine.
+        dtype: see Engine.
+    """
+
+    def __init__(self, model: Model, dtype: torch.dtype | None = None):
+        plan: Any = hypotheses_plan(model.structure) if isinstance(model, Model) else None
+        super().__init__(model, plan if isinstance(plan, Plan) else None, dtype)  # type: ignore[arg-type]
+
+    @classmethod
+    def bid(cls, structure: Structure) -> Bid:
+        """Serve models in which something is integrated, and all else finite or counted."""
+        found = hypotheses_plan(structure)
+        if isinstance(found, Bid):
+            return found
+        if not found.gaussian and not found.fields:
+            return Bid(0.0, "nothing that is hidden is Gaussian")
+        integrated = ", ".join(name for group in (*found.gaussian, *found.fields) for name in group)
+        given = f" given {', '.join(found.worlds)}" if found.worlds else ""
+        return Bid(1.0, f"affine and Gaussian{given}: {integrated}")
