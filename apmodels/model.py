@@ -105,6 +105,24 @@ class Model:
         """
         return scoring.log_prob(self, record)
 
+    def pyro(
+        self, steps: int | None = None, actions: Any = None, observations: Any = None, enumerate_finite: bool = True
+    ) -> Any:
+        """Return this model as a Pyro program without arguments, for SVI, NUTS and all else that Pyro has.
+
+        Args:
+            steps: how many steps; may be left out where a record is given.
+            actions: (steps, *shape), or (batch, steps, *shape) for a plate of records; dicts by name of several.
+            observations: likewise; NaN is missing. Where None, they are sample sites too.
+            enumerate_finite: mark hidden finite variables for parallel enumeration, which NUTS needs.
+
+        Returns:
+            A function whose sites are called like the variables, with ``_1``, ``_2`` ... after those that change.
+        """
+        from apmodels.pyro_export import export
+
+        return export(self, steps, actions, observations, enumerate_finite)
+
     @property
     def structure(self) -> Any:
         """The variables, the kind of every arrow, and what can be integrated; read once, by probing the laws."""
