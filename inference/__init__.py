@@ -14,3 +14,4 @@ from inference.kalman import Kalman as Kalman
 from inference.particles import Particles as Particles
 from inference.rao_blackwell import DepletionWarning as DepletionWarning
 from inference.rao_blackwell import RaoBlackwell as RaoBlackwell
+from inference.variational import Variational as Variational

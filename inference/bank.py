@@ -108,7 +108,10 @@ class Bank(Engine):
             for block, belief in zip(self.gaussians, step.gaussian, strict=True)
         ]
         fields = [block.start(step.frame, befores) for block in self.images]
-        finite = None if self.summed is None else self.summed.start(step.frame, befores, step.lead)
+        finite = None
+        if self.summed is not None:
+            finite, score = self.summed.start(step.frame, befores, step.lead)
+            weights = weights + score
         return BankBelief(
             engine=self,
             batch=batch,
@@ -217,6 +220,10 @@ class Bank(Engine):
             block, counts = self.tallies[at], step.counts[at]
             value = block.draw(counts, step.frame, name, step.lead, self.laws) if given is None else given
             step.counts[at], score = block.count(counts, step.frame, name, value)
+        elif kind == "finite":
+            # Scored with the rest of what tells of the finite variables.
+            assert given is not None, f"{name} can only be scored"
+            value, score = given, torch.zeros(step.lead)
         elif given is None:
             law, value = step.frame.draw(self.laws, name, step.lead)
             score = law.log_prob(value) if isinstance(law, Distribution) else torch.zeros(step.lead)
@@ -243,7 +250,7 @@ class Bank(Engine):
             step.fields[i], score = block.step(step.fields[i], step.frame, seen)
             scores.append(score)
         if self.summed is not None and step.finite is not None:
-            step.finite, score = self.summed.step(step.finite, step.frame, seen)
+            step.finite, score = self.summed.step(step.finite, step.frame)
             scores.append(score)
         for name in self.model.observation_names:
             kind, at = self.owner.get(name, ("", 0))

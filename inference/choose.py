@@ -10,8 +10,9 @@ from inference.exact import Exact
 from inference.kalman import Kalman
 from inference.particles import Particles
 from inference.rao_blackwell import RaoBlackwell
+from inference.variational import Variational
 
-ENGINES: list[type[Engine]] = [Exact, Kalman, RaoBlackwell, Particles]
+ENGINES: list[type[Engine]] = [Exact, Kalman, RaoBlackwell, Particles, Variational]
 
 
 def bids(model: Model) -> dict[str, Any]:

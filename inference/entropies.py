@@ -43,7 +43,13 @@ def entropy(engine: Any, belief: Any, names: tuple[str, ...]) -> Tensor:
         return _of_mixture(engine, belief, inner, outer)
     values = draw_values(engine, belief, KERNELS)
     lead = (len(belief.log_weights), KERNELS)
-    return _kernel([values[name].expand(*lead, *values[name].shape[2:]) for name in names])
+    return _kernel([_coordinates(engine, name, values[name], lead) for name in names])
+
+
+def _coordinates(engine: Any, name: str, value: Tensor, lead: tuple[int, int]) -> Tensor:
+    """A variable's free coordinates: of probabilities that sum to 1, all but the last."""
+    value = value.expand(*lead, *value.shape[2:])
+    return value[..., :-1] if engine.structure.nodes[name].family == "Dirichlet" else value
 
 
 def _within(engine: Any, belief: Any, names: list[str]) -> Tensor:

@@ -19,9 +19,11 @@ class FiniteBlock:
     """Log probabilities (rows, *sizes) over the joint values of a group, a row for every world of every belief."""
 
     def __init__(self, laws: Laws, structure: Structure, names: tuple[str, ...], seen: list[str]):
-        self.laws, self.names, self.seen = laws, names, seen
+        self.laws, self.names = laws, names
         values = {name: found for name, found in supports(laws, structure).items() if name in names}
-        roles = {name: structure.nodes[name].role for name in values}
+        roles = {name: structure.nodes[name].role for name in (*values, *seen)}
+        self.early = [name for name in seen if roles[name] == "static"]
+        self.seen = [name for name in seen if name not in self.early]
         remembered = laws.model.declaration.remembered
         self.statics = [Axis(name, 0, values[name]) for name in values if roles[name] == "static"]
         self.states = [Axis(name, 0, values[name]) for name in values if roles[name] == "state"]
@@ -34,8 +36,8 @@ class FiniteBlock:
     def _contexts(self, name: str) -> list[Key]:
         return [(p.name, p.lag) for p in self.laws.variables[name].parents if p.name not in self.names]
 
-    def start(self, frame: Frame, befores: dict[str, str | Tensor], lead: tuple[int, int]) -> Tensor:
-        """Return the prior, (*lead, *sizes)."""
+    def start(self, frame: Frame, befores: dict[str, str | Tensor], lead: tuple[int, int]) -> tuple[Tensor, Tensor]:
+        """Return the prior given the statics of the worlds, (*lead, *sizes), and how probable it makes those, lead."""
         known = [key for key in self.keys if not key[1] and key in frame.values]
         mesh = Slice(self.laws, self.axes, self._flat(frame, known, lead))
         logs = torch.zeros((1,) * (1 + len(self.axes)), dtype=self.laws.dtype)
@@ -43,7 +45,11 @@ class FiniteBlock:
             logs = logs + mesh.transition(axis)
         for axis in self.states:
             logs = logs + self._before(mesh, axis, befores.get(axis.name), lead)
-        return logs.expand(lead[0] * lead[1], *self.sizes).reshape(*lead, *self.sizes)
+        for name in self.early:
+            logs = logs + self._score(mesh, name, frame.values[name, 0], lead)
+        logs = logs.expand(lead[0] * lead[1], *self.sizes).reshape(*lead, *self.sizes)
+        total = logs.flatten(2).logsumexp(2)
+        return logs - total.reshape(*lead, *[1] * len(self.sizes)), total
 
     def _before(self, mesh: Slice, axis: Axis, before: str | Tensor | None, lead: tuple[int, int]) -> Tensor:
         if before is None:
@@ -59,10 +65,10 @@ class FiniteBlock:
         same = same.flatten(dims).all(-1) if same.dim() > dims else same
         return same.to(self.laws.dtype).log()
 
-    def step(self, logs: Tensor, frame: Frame, values: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+    def step(self, logs: Tensor, frame: Frame) -> tuple[Tensor, Tensor]:
         """Move on and condition on what is seen; return normalised log probabilities and the score, (b, n)."""
         lead = torch.broadcast_shapes(
-            logs.shape[:2], frame.lead(self.keys), *(values[name].shape[:2] for name in self.seen)
+            logs.shape[:2], frame.lead(self.keys), *(frame.values[name, 0].shape[:2] for name in self.seen)
         )
         logs = logs.expand(*lead, *self.sizes)
         axes = self.statics + self.previous + self.states
@@ -74,7 +80,7 @@ class FiniteBlock:
         factors += [mesh.transition(axis).exp() for axis in self.states]
         shift = top
         for name in self.seen:
-            score = self._score(mesh, name, values[name], lead)
+            score = self._score(mesh, name, frame.values[name, 0], lead)
             most = score.flatten(1).amax(1)
             most = torch.where(torch.isfinite(most), most, 0.0)
             factors.append((score - most.reshape(-1, *[1] * (score.dim() - 1))).exp())

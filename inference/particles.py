@@ -101,7 +101,7 @@ class _Guide(Bank):
             here.fields.append(images)
         if self.summed is not None:
             befores: dict[str, str | Tensor] = {axis.name: frame.values[axis.name, 1] for axis in self.summed.previous}
-            here.finite = self.summed.start(frame, befores, lead)
+            here.finite, _ = self.summed.start(frame, befores, lead)
         self.move(here)
         self.sense(here, seen)
         self._draw_all(here)

@@ -34,14 +34,18 @@ class Plan:
         return {name for group in (*self.gaussian, *self.fields, *self.counted) for name in group}
 
 
-def make_plan(structure: Structure, sampled: Iterable[str] = ()) -> Plan:
-    """Divide the hidden variables, where those ``sampled`` get values whatever could be done with them."""
-    return _Planner(structure, set(sampled)).plan()
+def make_plan(structure: Structure, sampled: Iterable[str] = (), scored: bool = False) -> Plan:
+    """Divide the hidden variables, where those ``sampled`` get values whatever could be done with them.
+
+    Where worlds are only ``scored``, and never drawn, finite variables may bear on them and still be summed.
+    """
+    return _Planner(structure, set(sampled), scored).plan()
 
 
 class _Planner:
-    def __init__(self, structure: Structure, forced: set[str]):
+    def __init__(self, structure: Structure, forced: set[str], scored: bool):
         self.structure = structure
+        self.scored = forced if scored else set()
         self.nodes = structure.nodes
         self.hidden = {node.name for node in structure.hidden}
         forced |= {node.name for node in structure.planned("sampled") if node.random}
@@ -81,7 +85,8 @@ class _Planner:
         for arrow in self.structure.out_of(name):
             child = self.nodes[arrow.child]
             mixed = any(other.parent in self.algebra for other in self.structure.into(child.name))
-            if (child.role == "observation" and mixed) or (child.role != "observation" and child.name not in members):
+            valued = child.role == "observation" or child.name in self.scored
+            if (valued and mixed) or (not valued and child.name not in members):
                 return False
         return not any(arrow.parent in self.algebra for arrow in self.structure.into(name))
 
