@@ -263,19 +263,6 @@ class Bank(Engine):
         for score in scores:
             step.score = step.score + score.to(self.dtype)
 
-    def seen_as(self, observation: Any, rows: int) -> Values:
-        """Return observations, checked, as (rows, 1, *shape) by name."""
-        flat = self._observations(observation, rows)
-        shaped = {}
-        for name, value in flat.items():
-            value = value.reshape(rows, *self.shown[name])
-            finite = torch.isfinite(value) | torch.isnan(value)
-            if not bool(finite.all()):
-                where = self.labels[name]
-                raise ValueOutOfRange(f"{where} is infinite in some element; observe a number, or NaN if it is missing")
-            shaped[name] = value[:, None]
-        return shaped
-
     def made(self, belief: BankBelief, step: Step, known: Values, weights: Tensor, seen: Values) -> BankBelief:
         """Return the belief after a step: ``weights`` (rows, worlds) are log p(world, observation)."""
         total = weights.logsumexp(1)

@@ -12,6 +12,8 @@ from inference.engine import Bid
 from inference.exact import Exact
 from inference.hypotheses import Hypotheses, hypotheses_plan
 from inference.plan import Plan
+from inference.statistic import Statistic, statistic
+from inference.worlds import BankBelief
 
 
 class Counting(Hypotheses):
@@ -23,6 +25,10 @@ class Counting(Hypotheses):
 
     def __repr__(self) -> str:
         return f"Exact({self.model!r})"
+
+    def statistic(self, belief: BankBelief) -> Statistic:
+        """Return what the hypotheses' posterior depends on: known states, and the counts that bear on them."""
+        return statistic(self, belief)
 
     @classmethod
     def bid(cls, structure: Structure) -> Bid:

@@ -142,6 +142,19 @@ class Engine(ABC):
             seen[name] = value if value.dim() == 2 else value.reshape(batch, -1)
         return seen
 
+    def seen_as(self, observation: Any, rows: int) -> Values:
+        """Return observations, checked, as (rows, 1, *shape) by name."""
+        flat = self._observations(observation, rows)
+        shaped = {}
+        for name, value in flat.items():
+            value = value.reshape(rows, *self.shown[name])
+            finite = torch.isfinite(value) | torch.isnan(value)
+            if not bool(finite.all()):
+                where = self.labels[name]
+                raise ValueOutOfRange(f"{where} is infinite in some element; observe a number, or NaN if it is missing")
+            shaped[name] = value[:, None]
+        return shaped
+
     def _batched(self, name: str, value: Tensor, shape: tuple[int, ...], batch: int) -> Tensor:
         if value.shape == shape:
             return value.unsqueeze(0) if batch == 1 else value.expand(batch, *shape)

@@ -7,10 +7,13 @@ from typing import Any
 import torch
 
 from apmodels import Model
+from apmodels.simulation import as_dict
 from apmodels.structure import Structure
 from inference.engine import Bid
 from inference.hypotheses import Hypotheses, hypotheses_plan
 from inference.plan import Plan
+from inference.smoothing import smoothed
+from inference.worlds import BankBelief
 
 
 class Kalman(Hypotheses):
@@ -28,6 +31,17 @@ class Kalman(Hypotheses):
     def __init__(self, model: Model, dtype: torch.dtype | None = None):
         plan: Any = hypotheses_plan(model.structure) if isinstance(model, Model) else None
         super().__init__(model, plan if isinstance(plan, Plan) else None, dtype)  # type: ignore[arg-type]
+
+    def smooth(self, actions: Any, observations: Any, batch: int | None = None) -> list[BankBelief]:
+        """Return the beliefs about each step of a record, given all of it; see ``filter`` for the arguments."""
+        beliefs = list(self.filter(actions, observations, batch))
+        acts = as_dict(actions, self.model.action_names, "action")
+        rows = 1 if batch is None else batch
+        each = []
+        for t in range(len(beliefs)):
+            at = {name: value.select(value.dim() - len(self.spaces[name].shape) - 1, t) for name, value in acts.items()}
+            each.append(self._actions(at or None, rows))
+        return smoothed(self, self.start(batch), beliefs, each)
 
     @classmethod
     def bid(cls, structure: Structure) -> Bid:
