@@ -3,6 +3,8 @@
 from inference.beliefs import Belief as Belief
 from inference.beliefs import FiniteBelief as FiniteBelief
 from inference.beliefs import Marginal as Marginal
+from inference.check import Report as Report
+from inference.check import check as check
 from inference.choose import bids as bids
 from inference.choose import choose as choose
 from inference.choose import explain as explain
