@@ -12,6 +12,8 @@ from inference.engine import Bid as Bid
 from inference.engine import Engine as Engine
 from inference.engine import Refusal as Refusal
 from inference.exact import Exact as Exact
+from inference.fit import Fit as Fit
+from inference.fit import fit as fit
 from inference.kalman import Kalman as Kalman
 from inference.particles import Particles as Particles
 from inference.rao_blackwell import DepletionWarning as DepletionWarning

@@ -108,7 +108,7 @@ class Exact(Engine):
         log_probs = weights.log_softmax(1)
         # Normalising lowers every log weight by the log of their sum, the largest too.
         total = weights.amax(1) - log_probs.amax(1)
-        if not math.isfinite(float(total if count == 1 else total.sum())):
+        if not math.isfinite(float((total if count == 1 else total.sum()).detach())):
             raise ValueOutOfRange(f"{type(self.model).__name__} gives what was observed no probability at all")
         log_probs = self.layout.padded(_shaped(log_probs, self.layout.present_sizes))
         evidence = total + evidence if shift is None else total + evidence + shift  # type: ignore[operator]
