@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from apmodels.distributions import base_of, family, parameters
+from apmodels.distributions import base_of, family, parameters, tensors
 from apmodels.errors import DeclarationError, ValueOutOfRange
 from apmodels.evidence import Evidence
 from apmodels.laws import Laws
@@ -166,6 +166,23 @@ class Probe:
                     reason = f"given {', '.join(given)}" if given else "constant slope, constant spread"
                     return kinds | {p.argument: (self._moved(child, p) or "affine", reason) for p in kept}
         return kinds
+
+    def is_smooth(self, child: Variable, parent: Parent) -> bool:
+        """Tell whether a law moves at all when a parent moves by next to nothing, in some probed world."""
+        here = {p.argument: self._value(p) for p in child.parents}
+        value = here[parent.argument]
+        if not value.is_floating_point():
+            return False
+        moved = here | {parent.argument: value * (1 + 1e-4) + 1e-4}
+        try:
+            with torch.no_grad():
+                laws = [self.laws.many(child.name, some, (WORLDS,)) for some in (here, moved)]
+        except (ValueOutOfRange, DeclarationError):
+            return True
+        pairs = zip(tensors(laws[0]), tensors(laws[1]), strict=True)
+        # Where next to all worlds stay just as they are, what changes does so in steps.
+        changed = [(a != b).reshape(WORLDS, -1).any(1).double().mean() for a, b in pairs if a.numel() >= WORLDS]
+        return not changed or float(max(changed)) > 0.2
 
     def _numel(self, parent: Parent) -> int:
         return self._value(parent)[0].numel()

@@ -62,13 +62,19 @@ class Node:
 
 @dataclass(frozen=True)
 class Arrow:
-    """One dependence: the parent, how many steps ago, the child, the kind and its reason."""
+    """One dependence: the parent, how many steps ago, the child, the kind and its reason.
+
+    ``first``: the parent is what the child's own parent was before time began. ``smooth``: False where the child
+    changes in steps, so that no gradient says which way.
+    """
 
     parent: str
     lag: int
     child: str
     kind: str
     why: str
+    first: bool = False
+    smooth: bool = True
 
 
 @dataclass(frozen=True)
@@ -168,12 +174,17 @@ class _Reader:
         # A variable that gives another its first value acts as that one does.
         direct = [p for p in parents if p in variable.parents]
         kinds = self.probe.kinds(variable, direct, self._conjugate_parents(variable, direct))
-        arrows = [Arrow(p.name, p.lag, variable.name, *kinds[p.argument]) for p in direct]
+        arrows = []
+        for p in direct:
+            kind, why = kinds[p.argument]
+            smooth = kind != "nonlinear" or self.probe.is_smooth(variable, p)
+            arrows.append(Arrow(p.name, p.lag, variable.name, kind, why, smooth=smooth))
         for p in parents:
             if p not in direct:
                 argument = next(q for q in direct if isinstance(q.before, Variable) and q.before.name == p.name)
                 kind, why = kinds[argument.argument]
-                arrows.append(Arrow(p.name, 0, variable.name, kind, f"the first {argument.argument}; {why}"))
+                why = f"the first {argument.argument}; {why}"
+                arrows.append(Arrow(p.name, 0, variable.name, kind, why, first=True))
         return arrows
 
     def _conjugate_parents(self, variable: Variable, parents: list[Parent]) -> list[Parent]:

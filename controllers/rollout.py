@@ -15,7 +15,7 @@ from torch import Tensor
 from apmodels import ValueOutOfRange
 from apmodels.simulation import as_dict
 from controllers.controller import Controller
-from inference import Belief, Engine
+from inference import Belief, Engine, Marginal
 
 # A loop that takes longer than this shows how far it is.
 PATIENCE = 2.0
@@ -43,7 +43,8 @@ def rollout(
 
     Returns:
         Dimensions ``episode`` and ``time``. Variables: every action and observation; ``entropy`` of the interest
-        (nats); ``marginal`` of the interest, or ``marginal_NAME`` where it is several variables; ``log_evidence``;
+        (nats); ``marginal`` of a finite interest, ``mean`` and ``variance`` of a continuous one, each followed by
+        ``_NAME`` where the interest is several variables; ``log_evidence``;
         ``act_seconds``, ``body_seconds``, ``update_seconds`` (time); ``truth_NAME`` where the body knows the truth.
     """
     if steps < 1:
@@ -99,8 +100,13 @@ class _Record:
         self._put("entropy", belief.entropy())
         self._put("log_evidence", belief.log_evidence)
         for name in self.interest:
-            label = "marginal" if len(self.interest) == 1 else f"marginal_{name}"
-            self._put(label, belief.marginal(name).probs)
+            suffix = "" if len(self.interest) == 1 else f"_{name}"
+            marginal = belief.marginal(name)
+            if isinstance(marginal, Marginal):
+                self._put(f"marginal{suffix}", marginal.probs)
+            else:
+                self._put(f"mean{suffix}", marginal.mean)
+                self._put(f"variance{suffix}", marginal.variance)
         self.seconds.append(seconds)
 
     def truth(self, values: dict[str, Tensor]) -> None:

@@ -46,6 +46,7 @@ class Bank(Engine):
         self.roles = {name: variable.role for name, variable in model.declaration.variables.items()}
         shapes = {node.name: tuple(node.shape) for node in nodes.values()}
         self.linear = Linear(model, shapes)
+        self.functions: dict[str, Tensor] = {}
         self.owner: dict[str, tuple[str, int]] = {}
         remembered = model.declaration.remembered
         self.gaussians = [

@@ -49,10 +49,15 @@ class _Planner:
         self.nodes = structure.nodes
         self.hidden = {node.name for node in structure.hidden}
         forced |= {node.name for node in structure.planned("sampled") if node.random}
-        self.algebra = {node.name for node in structure.planned("integrated", "counted")} - forced
-        self.finite = self._summable(forced)
-        self.worlds = {n.name for n in structure.hidden if n.random and n.name not in self.algebra | self.finite}
-        self.computed = self._computed()
+        while True:
+            self.algebra = {node.name for node in structure.planned("integrated", "counted")} - forced
+            self.finite = self._summable(forced)
+            self.worlds = {n.name for n in structure.hidden if n.random and n.name not in self.algebra | self.finite}
+            self.computed = self._computed()
+            missing = self._firsts() - self.worlds
+            if not missing:
+                break
+            forced |= missing
         self.finite -= self.computed
         self.algebra -= self.computed
 
@@ -68,6 +73,19 @@ class _Planner:
             fields,
             self._groups(counted),
         )
+
+    def _firsts(self) -> set[str]:
+        """The random variables that give a world's own variable its value before time began."""
+        valued = self.worlds | self.computed
+        found = {a.parent for a in self.structure.arrows if a.first and a.child in valued and a.parent in self.hidden}
+        waiting = list(found)
+        while waiting:
+            name = waiting.pop()
+            if not self.nodes[name].random:
+                more = {a.parent for a in self.structure.into(name) if a.parent in self.hidden} - found
+                found |= more
+                waiting += more
+        return {name for name in found if self.nodes[name].random}
 
     def _ordered(self, names: set[str]) -> tuple[str, ...]:
         return tuple(name for name in self.nodes if name in names)

@@ -27,6 +27,9 @@ def marginal(engine: Any, belief: Any, name: str) -> Any:
             values, logs = outcomes(engine, belief, (name,))
             return Marginal(_single(belief, logs), values[name])
         value = values_of(engine, belief, name)
+        if name == "interest" and not value.is_floating_point():
+            values, logs = shares(engine, value)
+            return Marginal(_single(belief, logs), values)
         weights = belief.log_weights if name != "interest" or value.shape[1] == belief.log_weights.shape[1] else None
         if weights is None:
             weights = torch.full(value.shape[:2], -math.log(value.shape[1]), dtype=engine.dtype)
@@ -37,6 +40,19 @@ def marginal(engine: Any, belief: Any, name: str) -> Any:
         hidden = [node.name for node in engine.structure.hidden]
         raise ValueOutOfRange(f"there is no variable {name}{nearest(name, hidden)}")
     raise ValueOutOfRange(f"{name} is {node.plan}, and no belief is held about it: see belief.known")
+
+
+def shares(engine: Any, drawn: Tensor) -> tuple[Tensor, Tensor]:
+    """The whole values (n, *shape) of a function of variables, those that the prior allows; and their log shares."""
+    flat = drawn.reshape(drawn.shape[0] * drawn.shape[1], -1)
+    if "values" not in engine.functions:
+        first = values_of(engine, engine.start(), "interest")
+        engine.functions["values"] = torch.unique(first.reshape(first.shape[1], -1), dim=0)
+    listed = engine.functions["values"]
+    table = torch.unique(torch.cat([listed, flat]), dim=0)
+    listed = listed if len(table) == len(listed) else table
+    same = (flat[:, None] == listed[None]).all(-1).reshape(*drawn.shape[:2], len(listed))
+    return listed.reshape(-1, *drawn.shape[2:]), same.to(engine.dtype).mean(1).log()
 
 
 def values_of(engine: Any, belief: Any, name: str) -> Tensor:

@@ -90,7 +90,7 @@ class RaoBlackwell(Bank):
             if node.role == "observation" and node.family == "Evidence" and _meets(structure, name, plan):
                 return Bid(0.0, f"{name} is an Evidence, and cannot be scored against what is integrated")
         if not plan.integrated and not plan.finite:
-            return Bid(0.6, f"{', '.join(sampled)} sampled, and nothing integrated: as plain particles")
+            return Bid(0.35, f"{', '.join(sampled)} sampled, and nothing integrated: plain particles do")
         rest = [*sorted(plan.integrated), *plan.finite]
         return Bid(0.8, f"{', '.join(sampled)} sampled; {', '.join(rest)} integrated")
 

@@ -108,6 +108,10 @@ class Variational(Engine):
                 and not arrow.lag
             ):
                 return Bid(0.0, f"{arrow.child} depends on {arrow.parent}, an observation of the same step")
+        for arrow in structure.arrows:
+            parent = structure.nodes[arrow.parent]
+            if not arrow.smooth and parent.hidden and parent.values is None:
+                return Bid(0.0, f"{arrow.child} changes in steps with {arrow.parent}: there is no gradient to follow")
         free = [n.name for n in structure.hidden if n.random and n.values is None]
         if not free:
             return Bid(0.1, "nothing that is hidden is continuous: there is nothing to fit")
