@@ -16,9 +16,9 @@ from torch.distributions import Distribution
 
 from apmodels.distributions import base_of, family, parameters, tensors
 from apmodels.errors import DeclarationError, ValueOutOfRange
-from apmodels.evidence import Evidence
 from apmodels.laws import Laws
 from apmodels.simulation import Values, Worlds, seeded
+from apmodels.supports import support_of
 from apmodels.transforms import recording_moves
 from apmodels.variables import Parent, Variable
 
@@ -29,29 +29,8 @@ COMBINATIONS = 1024
 NUMBERS = 20_000_000
 # Where on the line through two worlds (0 and 1) a law is evaluated.
 LINE = (0.0, 1.0, 0.37, -1.0, 2.6, -4.3, 11.0, -23.0, 61.0)
-LARGEST_SUPPORT = 4096
 
 Kind = tuple[str, str]
-
-
-def support_of(law: Any) -> Tensor | None:
-    """Return the finitely many values of a law, (size, *event shape), or None."""
-    if not isinstance(law, Distribution):
-        return None
-    base, added = base_of(law)
-    if not base.has_enumerate_support or isinstance(base, Evidence):
-        return None
-    try:
-        values = type(base).enumerate_support(base, expand=False)
-    except NotImplementedError:
-        return None
-    # One element's values (n, *its shape), and every combination of the elements'.
-    values = values.reshape(len(values), *base.event_shape)
-    elements = torch.Size(law.event_shape[:added]).numel()
-    if len(values) ** elements > LARGEST_SUPPORT:
-        return None
-    picks = torch.cartesian_prod(*[torch.arange(len(values))] * elements)
-    return values[picks].reshape(-1, *law.event_shape)
 
 
 class _ProbedWorlds(Worlds):

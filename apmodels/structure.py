@@ -26,7 +26,8 @@ from typing import Any
 from torch import Tensor
 
 from apmodels.distributions import family
-from apmodels.probing import Probe, support_of
+from apmodels.probing import Probe
+from apmodels.supports import support_of
 from apmodels.variables import Parent, Variable
 
 GAUSSIAN = ("Normal", "MultivariateNormal")

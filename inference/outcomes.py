@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from apmodels import ValueOutOfRange
-from apmodels.probing import LARGEST_SUPPORT
+from apmodels.supports import LARGEST_SUPPORT
 from inference.frame import Frame
 
 

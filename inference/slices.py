@@ -17,8 +17,8 @@ from torch.distributions import Distribution
 from apmodels import ValueOutOfRange
 from apmodels.distributions import picked
 from apmodels.laws import Laws
-from apmodels.probing import support_of
 from apmodels.structure import Structure
+from apmodels.supports import support_of
 from apmodels.variables import Variable
 
 LARGEST_SUPPORT = 4096

@@ -38,7 +38,7 @@ from apmodels import (
     window,
     zeros,
 )
-from apmodels.probing import support_of
+from apmodels.supports import support_of
 from tests.models import Contingency, LearningToLook, RandomWalk, Tracking, Weather
 
 few = settings(deadline=None, max_examples=25)
