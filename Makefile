@@ -35,6 +35,14 @@ lint: .venv/.tested
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 
+# Ratios to peers, which are installed for it and for nothing else.
+.venv/.benched: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[bench]"
+	touch $@
+
+bench: .venv/.benched
+	$(BIN)/python -m benchmarks
+
 data: $(STAMP)
 	$(BIN)/python -m experiments.data
 
