@@ -1,14 +1,14 @@
 """Brute force: what a belief must be, computed without any engine.
 
 Worlds are enumerated where hidden variables are finite; what is Gaussian given those is conditioned on as one joint
-Gaussian of the whole record; what is neither is drawn from its prior and weighed, with a standard error.
+Gaussian of the whole record; static rates are integrated on a grid; what is neither is drawn from its prior and
+weighed, with a standard error.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -17,29 +17,12 @@ from torch.distributions import Distribution
 
 from apmodels.distributions import base_of, log_prob_of
 from apmodels.laws import Laws
-from apmodels.simulation import Values, Worlds, seeded
+from apmodels.simulation import Values
 from apmodels.variables import Variable
+from inference.weighed_worlds import WORLDS, Reference, drawn, gridded, same
 
-# So many trajectories of finite values are enumerated, and so many worlds drawn where that is not enough.
+# So many trajectories of finite values are enumerated.
 TRAJECTORIES = 20_000
-WORLDS = 400_000
-CHUNK = 100_000
-
-
-@dataclass(frozen=True)
-class Reference:
-    """Log evidence (nats); and of every checked variable its mean and standard deviation, or its probabilities.
-
-    ``moments`` name -> (mean, standard deviation), each (*shape); ``probs`` name -> probabilities over the variable's
-    values; ``errors`` name -> standard error of the mean or the probabilities, 0 where the method is exact.
-    """
-
-    method: str
-    log_evidence: float
-    evidence_error: float
-    probs: dict[str, Tensor]
-    moments: dict[str, tuple[Tensor, Tensor]]
-    errors: dict[str, Tensor]
 
 
 def reference(
@@ -51,10 +34,21 @@ def reference(
     finite = [node for node in structure.hidden if node.random and node.values is not None]
     rest = [node for node in structure.hidden if node.random and node.values is None]
     number = math.prod(len(n.values) ** (1 if n.role == "static" else steps) for n in finite if n.values is not None)
+    if rest and all(_on_grid(model, node) for node in (*finite, *rest)):
+        found = gridded(model, actions, seen, names)
+        if found is not None:
+            return found
     gaussian = all(node.plan == "integrated" for node in rest)
     if number <= TRAJECTORIES and gaussian and (not rest or _affine_seen(structure)):
         return _enumerated(model, actions, seen, names)
-    return _drawn(model, actions, seen, names, worlds, seed)
+    return drawn(model, actions, seen, names, worlds, seed)
+
+
+def _on_grid(model: Any, node: Any) -> bool:
+    """Whether a variable is static, and finite or a Beta without parents: to be integrated exactly on a grid."""
+    return node.role == "static" and (
+        node.values is not None or (node.family == "Beta" and not model.structure.into(node.name))
+    )
 
 
 def _affine_seen(structure: Any) -> bool:
@@ -173,8 +167,7 @@ def _enumerated(model: Any, actions: Values, seen: Values, names: list[str]) -> 
         means = torch.stack([values[name][0] for values in found])
         wide = weights.reshape(-1, *[1] * (means.dim() - 1))
         if node.values is not None:
-            same = _same(means, node.values)
-            probs[name] = (weights[:, None] * same).sum(0)
+            probs[name] = (weights[:, None] * same(means, node.values)).sum(0)
             errors[name] = torch.zeros_like(probs[name])
             continue
         mean = (wide * means).sum(0)
@@ -216,78 +209,3 @@ def _conditioned(world: _World, names: list[str]) -> tuple[float, dict[str, tupl
         variance = (way * way).sum(1) - ((cross @ solved) * way).sum(1)
         values[name] = after.reshape(here.shape), variance.reshape(here.shape)
     return score, values
-
-
-def _same(values: Tensor, listed: Tensor) -> Tensor:
-    """Which of the listed values each value is, (n, listed)."""
-    flat = listed.double().reshape(len(listed), -1)
-    return (values.double().reshape(len(values), 1, -1) == flat).all(-1)
-
-
-def _drawn(model: Any, actions: Values, seen: Values, names: list[str], count: int, seed: int) -> Reference:
-    """Draw worlds from the prior, weigh them by the record."""
-    logs, values = [], {name: [] for name in names}
-    with seeded(seed):
-        for start in range(0, count, CHUNK):
-            part, found = _weighed(model, actions, seen, min(CHUNK, count - start))
-            logs.append(part)
-            for name in names:
-                values[name].append(found[name])
-    weights = torch.cat(logs).double()
-    top = weights.max()
-    relative = (weights - top).exp()
-    mean = relative.mean()
-    evidence = float(mean.log() + top)
-    error = float(relative.std() / mean / math.sqrt(count))
-    weights = relative / relative.sum()
-    probs, moments, errors = {}, {}, {}
-    for name in names:
-        node = model.structure.nodes[name]
-        value = torch.cat(values[name]).double()
-        if node.values is not None:
-            value = _same(value, node.values).double()
-        wide = weights.reshape(-1, *[1] * (value.dim() - 1))
-        centre = (wide * value).sum(0)
-        errors[name] = (wide**2 * (value - centre) ** 2).sum(0).sqrt()
-        if node.values is not None:
-            probs[name] = centre
-        else:
-            moments[name] = centre, (wide * (value - centre) ** 2).sum(0).sqrt()
-    return Reference(f"{count:,} worlds drawn from the prior", evidence, error, probs, moments, errors)
-
-
-def _weighed(model: Any, actions: Values, seen: Values, count: int) -> tuple[Tensor, Values]:
-    laws = Laws(model)
-    worlds = _SeenWorlds(laws, count)
-    for t in range(len(next(iter(seen.values())))):
-        worlds.now = {name: value[t] for name, value in seen.items()}
-        worlds.step({name: value[t].expand(count, *value.shape[1:]) for name, value in actions.items()})
-    return worlds.total, {**worlds.statics, **worlds.values}
-
-
-class _SeenWorlds(Worlds):
-    """Worlds that draw what is hidden, and score what was seen."""
-
-    def __init__(self, laws: Laws, batch: int):
-        self.total, self.now = torch.zeros(batch), {}
-        super().__init__(laws, batch)
-
-    def _draw(self, variable: Variable, values: Values) -> Tensor:
-        if variable.role != "observation":
-            return super()._draw(variable, values)
-        y = self.now[variable.name].to(self.laws.dtype)
-        wide = y.expand(self.batch, *y.shape)
-        law = self.laws.many(variable.name, self.parents(variable, values), (self.batch,))
-        if isinstance(law, Tensor):
-            same = (
-                (torch.isnan(wide) | (law == wide)).flatten(1).all(1)
-                if law.dim() > 1
-                else torch.isnan(wide) | (law == wide)
-            )
-            self.total = self.total + same.to(self.laws.dtype).log()
-        else:
-            self.total = self.total + self.laws.score(
-                variable.name, self.parents(variable, values), wide, (self.batch,)
-            )
-        whole = self.laws.model.structure.nodes[variable.name].family == "Categorical"
-        return wide.long() if whole and not bool(torch.isnan(y).any()) else wide

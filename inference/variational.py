@@ -1,8 +1,8 @@
 """Stochastic variational inference, with Pyro's automatic guides, on any model that can be scored.
 
 The guide is fitted to the whole record; finite variables are enumerated. Draws from it are then weighed by how probable
-they make the record, the finite variables summed in each, so that what is reported is as good as the guide covers the
-posterior, and not as bad as its shape.
+they make the record, the finite variables summed in each, and drawn anew where the weights say (adaptive importance
+sampling): what is reported is as good as the draws cover the posterior, and not as bad as the guide's shape.
 """
 
 from __future__ import annotations
@@ -27,12 +27,14 @@ from inference.beliefs import Belief
 from inference.draws import draw_values
 from inference.engine import Bid, Engine
 from inference.particles import Particles
-from inference.posterior_draws import Draws, guide_draws
+from inference.posterior_draws import Draws, Proposal, proposal
 from inference.rao_blackwell import DepletionWarning, effective
 from inference.scored_bank import ScoredBank
 from inference.worlds import BankBelief
 
 GUIDES = {"full": AutoMultivariateNormal, "diagonal": AutoNormal}
+# The draws are weighed, and taken anew where their weights say, until this share is effective, or so many times.
+PLENTY, ROUNDS = 0.4, 8
 # Records that take longer show how far they are.
 LONG = 2000
 
@@ -173,14 +175,14 @@ class Variational(Engine):
         if "posterior" not in belief.kept:
             # A parameter store of its own: a user's other guides stay as they are.
             with pyro.get_param_store().scope(), seeded(self.seed * 1_000_003 + belief.time):
-                draws = self._fitted(belief)
-                belief.kept["posterior"] = self._weighed(belief, draws)
+                belief.kept["posterior"] = self._weighed(belief, self._fitted(belief))
         return belief.kept["posterior"]
 
-    def _fitted(self, belief: VariationalBelief) -> Draws:
+    def _fitted(self, belief: VariationalBelief) -> Proposal | None:
+        """Fit a guide to the record; None where nothing is continuous yet."""
         free = [name for name in self.bank.plan.worlds if belief.time or self.bank.roles[name] == "static"]
         if not free:
-            return Draws({}, torch.zeros(belief.batch or 1, 1, dtype=self.dtype))
+            return None
         program = self._program(belief)
         hidden = [site for site in self._finite_sites(belief)]
         guide = self._guide(poutine.block(program, hide=hidden), belief.batch)
@@ -200,7 +202,7 @@ class Variational(Engine):
                     f"the fit of {type(self.model).__name__} diverged; try a smaller rate than {self.rate}"
                 )
         belief.kept["parameters"] = {name: p.detach().clone() for name, p in guide.named_parameters()}
-        return guide_draws(guide, self.draws, belief.batch or 1)
+        return proposal(guide, belief.batch or 1)
 
     def _program(self, belief: VariationalBelief) -> Any:
         rows = belief.batch or 1
@@ -239,10 +241,18 @@ class Variational(Engine):
                 if name in known and known[name].shape == parameter.shape:
                     parameter.copy_(known[name])
 
-    def _weighed(self, belief: VariationalBelief, draws: Draws) -> BankBelief:
-        found = self.bank.scored(belief.batch, belief.record, draws)
-        fewest = float(effective(found.log_weights).min())
-        if draws.values and fewest < max(10.0, 0.005 * self.draws):
+    def _weighed(self, belief: VariationalBelief, guide: Proposal | None) -> BankBelief:
+        if guide is None:
+            blank = torch.zeros(belief.batch or 1, 1, dtype=self.dtype)
+            return self.bank.scored(belief.batch, belief.record, Draws({}, blank, blank[..., None]))
+        for _ in range(ROUNDS):
+            draws = guide.draw(self.draws)
+            found = self.bank.scored(belief.batch, belief.record, draws)
+            fewest = float(effective(found.log_weights).min())
+            if fewest > PLENTY * self.draws:
+                break
+            guide = guide.learned(draws, found.log_weights)
+        if fewest < max(10.0, 0.005 * self.draws):
             warnings.warn(
                 f"{type(self.model).__name__}: the guide covers the posterior of step {belief.time} badly "
                 f"({fewest:.1f} of {self.draws} draws carry the weight); use another guide, or more iterations",
