@@ -25,6 +25,7 @@ SERIES, STEPS = 1000, 200
 FILTERPY_SERIES = 20
 PARTICLES = 10_000
 REST = 0.02
+STILL = torch.zeros(4)
 
 
 def measure() -> dict[str, float]:
@@ -41,7 +42,7 @@ class Moving(Model):
     push: Tensor = 0.1 * torch.tensor([[1 / 3, 0, 1 / 2, 0], [0, 1 / 3, 0, 1 / 2], [1 / 2, 0, 1, 0], [0, 1 / 2, 0, 1]])
 
     @state
-    def motion(self, prev_motion=torch.zeros(4)):
+    def motion(self, prev_motion=STILL):
         return MultivariateNormal(self.move @ prev_motion, self.push)
 
     @observation

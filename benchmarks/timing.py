@@ -7,9 +7,7 @@ import time
 from collections.abc import Callable
 
 
-def milliseconds(
-    *functions: Callable[[], object], repeats: int = 20, inner: int = 1, rest: float = 0.0
-) -> list[float]:
+def milliseconds(*functions: Callable[[], object], repeats: int = 20, inner: int = 1, rest: float = 0.0) -> list[float]:
     """Return each function's median time in ms, run in turn, so that a busy machine is busy for all of them.
 
     ``rest`` are seconds before each, in which threads that one of them has woken go to sleep.

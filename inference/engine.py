@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +15,7 @@ from apmodels.laws import Laws
 from apmodels.simulation import Values, as_dict
 from apmodels.structure import Structure
 from inference.beliefs import Belief
+from inference.record import Record
 
 
 class Refusal(TypeError):
@@ -96,21 +98,22 @@ class Engine(ABC):
         outcomes, otherwise an average over ``samples`` imagined observations, with common random numbers.
         """
 
-    def filter(self, actions: Any, observations: Any, batch: int | None = None) -> list[Any]:
-        """Return the beliefs after each step of a record, (steps, *shape) or (batch, steps, *shape)."""
-        acts = as_dict(actions, self.model.action_names, "action")
-        seen = as_dict(observations, self.model.observation_names, "observation")
-        shapes = {name: space.shape for name, space in self.spaces.items()} | self.shown
-        # A record without a batch dimension goes for the whole batch.
-        at = {name: value.dim() - len(shapes[name]) - 1 for name, value in (acts | seen).items()}
-        lengths = {name: value.shape[at[name]] for name, value in (acts | seen).items()}
-        if len(set(lengths.values())) > 1:
-            raise ValueOutOfRange(f"the records differ in their number of steps: {lengths}")
+    def filter(self, actions: Any, observations: Any, batch: int | None = None) -> Sequence[Any]:
+        """Return the beliefs after each step of a record, (steps, *shape) or (batch, steps, *shape).
+
+        They are those that ``update`` returns, step by step; but what can be done for all steps at once is.
+        """
+        return self.along(Record.of(self, actions, observations), batch)
+
+    def along(self, record: Record, batch: int | None) -> Sequence[Any]:
+        """Return the beliefs along a record."""
+        return self.stepwise(self.start(batch), record)
+
+    def stepwise(self, belief: Any, record: Record, first: int = 0, last: int | None = None) -> list[Any]:
+        """Return the beliefs along a record's steps first ... last - 1, each updated from the one before."""
         beliefs = []
-        belief = self.start(batch)
-        for t in range(next(iter(lengths.values()))):
-            act, see = ({name: v.select(at[name], t) for name, v in record.items()} for record in (acts, seen))
-            belief = self.update(belief, act or None, see)
+        for t in range(first, record.steps if last is None else last):
+            belief = self.update(belief, *record.step(t))
             beliefs.append(belief)
         return beliefs
 
