@@ -30,6 +30,7 @@ def reference(
 ) -> Reference:
     """Return what is to be believed after a record: ``actions`` and ``seen`` (steps, *shape) by name."""
     steps = len(next(iter(seen.values())))
+    actions = {name: value.double() if value.is_floating_point() else value for name, value in actions.items()}
     structure = model.structure
     finite = [node for node in structure.hidden if node.random and node.values is not None]
     rest = [node for node in structure.hidden if node.random and node.values is None]

@@ -18,7 +18,7 @@ from apmodels.simulation import Values
 from inference.worlds import BankBelief, flat, pick
 
 # Metropolis steps after each resampling.
-SWEEPS = 1
+SWEEPS = 3
 
 
 @dataclass(frozen=True)

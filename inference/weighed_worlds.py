@@ -141,7 +141,8 @@ def weighed(
     worlds = _SeenWorlds(laws, count, given)
     for t in range(len(next(iter(seen.values())))):
         worlds.now = {name: value[t] for name, value in seen.items()}
-        worlds.step({name: value[t].expand(count, *value.shape[1:]) for name, value in actions.items()})
+        acts = {n: v.to(laws.dtype) if v.is_floating_point() else v for n, v in actions.items()}
+        worlds.step({name: value[t].expand(count, *value.shape[1:]) for name, value in acts.items()})
     return worlds.total, {**worlds.statics, **worlds.values}
 
 
