@@ -108,7 +108,7 @@ class Laws:
             value = value(self.model)
         with _default_dtype(self.dtype):
             first = torch.as_tensor(value)
-        return first.to(self.dtype) if not first.is_floating_point() and self._is_real(name) else first
+        return first.to(self.dtype) if first.is_floating_point() or self._is_real(name) else first
 
     def _is_real(self, name: str) -> bool:
         """Whether a variable's later values are floating-point numbers, though its first one is written whole."""

@@ -1,4 +1,4 @@
-"""A chain of images of independent pixels that are only ever moved: two images, a mean and a variance.
+"""An image of independent pixels that is only ever moved: two images, a mean and a variance.
 
 What a move does to means it does to variances; the way back, from what is seen to where it was, is the move's own
 derivative (thesis eqs 6.31 to 6.40).
@@ -22,7 +22,10 @@ Images = dict[str, tuple[Tensor, Tensor]]
 
 
 class FieldBlock:
-    """Means and variances of the images of a group, moved on one by one."""
+    """The mean and variance of the image of a group; of a state, perhaps with a static that it begins as.
+
+    What a state began as is forgotten in the first step: from then on the two depend on each other.
+    """
 
     def __init__(self, laws: Laws, names: tuple[str, ...], seen: list[str], roles: dict[str, str], remembered: Any):
         self.laws, self.seen = laws, seen
@@ -48,7 +51,7 @@ class FieldBlock:
     def step(self, images: Images, frame: Frame, seen: dict[str, Tensor]) -> tuple[Images, Tensor]:
         """Move the images on and condition on what is seen; return the images and the score, (b, n)."""
         past = dict(images)
-        now = {name: images[name] for name in self.statics}
+        now = self._now(images)
         for name in self.states:
             now[name] = self._moved(name, frame, now, past)
         total = torch.zeros(1, 1, dtype=self.laws.dtype)
@@ -60,7 +63,7 @@ class FieldBlock:
 
     def imagine(self, images: Images, frame: Frame, lead: tuple[int, int]) -> dict[str, Tensor]:
         """Draw what would be seen after a step, (*lead, *shape) by name."""
-        now = {name: images[name] for name in self.statics}
+        now = self._now(images)
         for name in self.states:
             now[name] = self._moved(name, frame, now, images)
         seen = {}
@@ -71,10 +74,14 @@ class FieldBlock:
 
     def predicted(self, name: str, images: Images, frame: Frame) -> tuple[Tensor, Tensor]:
         """Return the mean and the variance of what would be seen after a step."""
-        now = {static: images[static] for static in self.statics}
+        now = self._now(images)
         for other in self.states:
             now[other] = self._moved(other, frame, now, images)
         return self._predicted(name, frame, now)
+
+    def _now(self, images: Images) -> Images:
+        """What of the last step is still there in this one."""
+        return {} if self.states else {name: images[name] for name in self.statics}
 
     def _predicted(self, name: str, frame: Frame, now: Images) -> tuple[Tensor, Tensor]:
         source = next(p.name for p in self.laws.variables[name].parents if p.name in self.group)

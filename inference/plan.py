@@ -128,15 +128,24 @@ class _Planner:
         return tuple(dict.fromkeys(self._ordered(group[name]) for name in self._ordered(names)))
 
     def _is_field(self, group: tuple[str, ...]) -> bool:
-        """Whether a group is one chain of images that are only ever moved, seen by moved observations."""
+        """Whether a group is one image that is only ever moved, seen by moved observations.
+
+        Two images would depend on each other, pixel by pixel, once something was seen of either. What one was before
+        time began may be another, if nobody asks for that one any more.
+        """
         arrows = [arrow for name in group for arrow in self.structure.out_of(name)]
-        if not any(arrow.kind == "moves" for arrow in arrows):
-            return False
+        lasting = [name for name in group if not self._is_first(name)]
         return (
-            all(self._moves(arrow, group) for arrow in arrows)
+            len(lasting) == 1
+            and any(arrow.kind == "moves" for arrow in arrows)
+            and all(self._moves(arrow, group) for arrow in arrows)
             and all(self.nodes[name].family in ("Normal", "deterministic") for name in group)
-            and all(sum(a.child in group for a in self.structure.out_of(name)) <= 1 for name in group)
         )
+
+    def _is_first(self, name: str) -> bool:
+        """Whether a variable is nothing but what another one was before time began."""
+        out = self.structure.out_of(name)
+        return bool(out) and all(arrow.first for arrow in out) and name not in self.structure.interest
 
     def _moves(self, arrow: Arrow, group: tuple[str, ...]) -> bool:
         child: Node = self.nodes[arrow.child]

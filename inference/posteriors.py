@@ -86,7 +86,9 @@ def _integrated(engine: Any, belief: Any, name: str) -> Any:
     for i, group in enumerate(engine.plan.fields):
         if name in group:
             if name not in belief.fields[i]:
-                raise ValueOutOfRange(f"{name} has no value before the first step")
+                gone = engine.roles[name] == "static"
+                when = "is not kept after the first step: it is only what another was" if gone else "has no value"
+                raise ValueOutOfRange(f"{name} {when} before {'time began' if gone else 'the first step'}")
             mean, variance = (part.expand(rows, worlds, *shape) for part in belief.fields[i][name])
             return _mixture(belief, [mean, variance.sqrt(), len(shape)], worlds)
     index = next(i for i, group in enumerate(engine.plan.counted) if name in group)
