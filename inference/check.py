@@ -139,8 +139,10 @@ def simulated(model: Model, steps: int, seed: int, missing: float = 0.0) -> tupl
     return {name: record[name] for name in model.action_names}, seen
 
 
-def compare(model: Model, name: str, data: list, truths: list[Reference]) -> list[Row]:
-    """Return a row for every variable of interest: one engine against what is true of some records."""
+def compare(
+    model: Model, name: str, data: list, truths: list[Reference], options: dict[str, Any] | None = None
+) -> list[Row]:
+    """Return a row for every variable of interest: one engine, with other options, against what is true of records."""
     kind = next(engine for engine in ENGINES if engine.__name__ == name)
     names = list(model.structure.interest)
     errors = {variable: (0.0, 0.0) for variable in names}
@@ -148,7 +150,7 @@ def compare(model: Model, name: str, data: list, truths: list[Reference]) -> lis
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            engine = kind(model, **OPTIONS[name])
+            engine = kind(model, **OPTIONS[name] | (options or {}))
             for (actions, seen), truth in zip(data, truths, strict=True):
                 belief = list(engine.filter(as_given(actions), as_given(seen)))[-1]
                 evidence = max(evidence, abs(float(belief.log_evidence) - truth.log_evidence))

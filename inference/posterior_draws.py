@@ -74,7 +74,7 @@ def proposal(guide: Any, rows: int) -> Proposal:
                 sites.append((name, tuple(guide._unconstrained_shapes[name]), way))
                 continue
             loc, scale = guide._get_loc_and_scale(name)
-            batched = len(guide._cond_indep_stacks[name]) > 0
+            batched = len(trace.nodes[name]["cond_indep_stack"]) > 0
             loc, scale = (part if batched else part[None] for part in (loc, scale))
             sites.append((name, tuple(loc.shape[1:]), way))
             centres.append(loc.expand(rows, *loc.shape[1:]).reshape(rows, -1))

@@ -83,9 +83,9 @@ class Variational(Engine):
         self,
         model: Model,
         guide: Any = "full",
-        iterations: int = 400,
+        iterations: int = 150,
         draws: int = 4000,
-        rate: float = 0.03,
+        rate: float = 0.05,
         dtype: torch.dtype | None = None,
         seed: int = 0,
     ):
