@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import pyro
@@ -23,13 +23,14 @@ from torch import Tensor
 from apmodels import Model, ValueOutOfRange
 from apmodels.simulation import Values, as_given, seeded
 from apmodels.structure import Structure
-from inference.beliefs import Belief
+from inference.amortised import Amortised
 from inference.draws import draw_values
 from inference.engine import Bid, Engine
 from inference.particles import Particles
 from inference.posterior_draws import Draws, Proposal, proposal
 from inference.rao_blackwell import DepletionWarning, effective
 from inference.scored_bank import ScoredBank
+from inference.variational_belief import VariationalBelief, line
 from inference.worlds import BankBelief
 
 GUIDES = {"full": AutoMultivariateNormal, "diagonal": AutoNormal}
@@ -39,34 +40,12 @@ PLENTY, ROUNDS = 0.4, 8
 LONG = 2000
 
 
-@dataclass(frozen=True)
-class VariationalBelief(Belief):
-    """A record, and the posterior that is fitted to it when it is first asked for.
-
-    ``record`` are the (actions, observations) of every step, each (rows, ...) by name.
-    """
-
-    record: tuple[tuple[Values, Values], ...] = field(repr=False)
-    before: Any = field(repr=False, compare=False, default=None)
-    # Where the posterior is kept, once it was asked for.
-    kept: dict = field(repr=False, compare=False, default_factory=dict)
-
-    @property
-    def log_evidence(self) -> Tensor:  # type: ignore[override]
-        """log p(observations | actions), nats, (*batch,): the log of the mean weight of the draws."""
-        return self.engine.posterior(self).log_evidence
-
-    @log_evidence.setter
-    def log_evidence(self, value: Any) -> None:
-        # Known once the posterior is; the field of every belief is not kept.
-        pass
-
-
 class Variational(Engine):
     """Fits a guide over everything continuous to the whole record; what is finite is enumerated.
 
     A belief is fitted when something is asked of it, starting from where the fit of the step before ended, so that a
-    belief asked for at every step is learned online; one asked for at the end costs one fit.
+    belief asked for at every step is learned online; one asked for at the end costs one fit. After :meth:`learn` a
+    network that was taught by simulated records takes the place of fitting.
 
     Args:
         model: see Engine.
@@ -95,8 +74,30 @@ class Variational(Engine):
         if iterations < 1 or draws < 2:
             raise ValueOutOfRange(f"a fit needs iterations and draws, not {iterations} and {draws}")
         self.guide, self.iterations, self.draws, self.rate, self.seed = guide, iterations, draws, rate, seed
+        self.network: Amortised | None = None
         self.bank = ScoredBank(model, self.dtype)
         self.loose = Particles(model, particles=1024, dtype=self.dtype, guided=False)
+
+    def learn(self, steps: int = 10, rounds: int = 400, records: int = 256, rate: float = 3e-3) -> list[float]:
+        """Learn a guide that serves every record at once, from records that the model itself simulates (amortised).
+
+        Args:
+            steps: how long the records may be.
+            rounds: how many batches.
+            records: how many in a batch.
+            rate: the step of Adam, at first.
+
+        Returns:
+            How unlikely the hidden variables were, batch by batch, nats.
+        """
+        free = [name for name in self.bank.plan.worlds if self.structure.nodes[name].values is None]
+        if not free:
+            raise ValueOutOfRange(f"nothing that {type(self.model).__name__} hides is continuous: nothing to learn")
+        with seeded(self.seed):
+            network = Amortised(self.model, free)
+            losses = network.learn(steps, rounds, records, rate, self.seed)
+        self.network = network
+        return losses
 
     @classmethod
     def bid(cls, structure: Structure) -> Bid:
@@ -183,6 +184,8 @@ class Variational(Engine):
         free = [name for name in self.bank.plan.worlds if belief.time or self.bank.roles[name] == "static"]
         if not free:
             return None
+        if self.network is not None:
+            return self.network.proposal(*self._record(belief))
         program = self._program(belief)
         hidden = [site for site in self._finite_sites(belief)]
         guide = self._guide(poutine.block(program, hide=hidden), belief.batch)
@@ -192,7 +195,7 @@ class Variational(Engine):
         elbo = loss(num_particles=4, vectorize_particles=True, max_plate_nesting=planes)
         rate = {"lr": self.rate, "lrd": 0.1 ** (1 / self.iterations)}
         svi = SVI(program, guide, pyro.optim.ClippedAdam(rate), loss=elbo)  # type: ignore[attr-defined]
-        warm = any("parameters" in b.kept for b in _line(belief))
+        warm = any("parameters" in b.kept for b in line(belief))
         many = max(self.iterations // 4, 1) if warm else self.iterations
         rounds = track(range(many), "fitting", transient=True) if many * belief.time > LONG else range(many)
         for _ in rounds:
@@ -204,13 +207,18 @@ class Variational(Engine):
         belief.kept["parameters"] = {name: p.detach().clone() for name, p in guide.named_parameters()}
         return proposal(guide, belief.batch or 1)
 
-    def _program(self, belief: VariationalBelief) -> Any:
+    def _record(self, belief: VariationalBelief) -> tuple[Values, Values]:
+        """The record so far: actions and observations (rows, steps, *shape) by name."""
         rows = belief.batch or 1
         actions = {n: torch.zeros(rows, 0, *space.shape) for n, space in self.spaces.items()}
         seen = {n: torch.zeros(rows, 0, *shape, dtype=self.dtype) for n, shape in self.shown.items()}
         if belief.record:
             actions = {n: torch.stack([a[n] for a, _ in belief.record], 1) for n in actions}
             seen = {n: torch.stack([s[n][:, 0] for _, s in belief.record], 1) for n in seen}
+        return actions, seen
+
+    def _program(self, belief: VariationalBelief) -> Any:
+        actions, seen = self._record(belief)
         if belief.batch is None:
             actions, seen = ({n: v[0] for n, v in some.items()} for some in (actions, seen))
         return self.model.pyro(None, as_given(actions), as_given(seen))
@@ -233,7 +241,7 @@ class Variational(Engine):
 
     def _warm(self, guide: Any, belief: VariationalBelief) -> None:
         """Begin where the fit of an earlier step ended, for what it knew already."""
-        known = next((b.kept["parameters"] for b in _line(belief) if "parameters" in b.kept), None)
+        known = next((b.kept["parameters"] for b in line(belief) if "parameters" in b.kept), None)
         if known is None or not isinstance(guide, AutoNormal):
             return
         with torch.no_grad():
@@ -260,11 +268,3 @@ class Variational(Engine):
                 stacklevel=4,
             )
         return found
-
-
-def _line(belief: VariationalBelief) -> Any:
-    """The beliefs before one, the latest first."""
-    node = belief.before
-    while node is not None:
-        yield node
-        node = node.before

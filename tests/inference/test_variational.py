@@ -52,6 +52,22 @@ def test_a_batch_is_fitted_in_one_go():
     assert float((exact.log_evidence - found.log_evidence).abs().max()) < 0.1
 
 
+def test_a_guide_learned_once_serves_every_record():
+    model = Contingency(presence=0.4)
+    engine = Variational(model)
+    losses = engine.learn(steps=8, rounds=80, records=128)
+    assert sum(losses[-10:]) < sum(losses[:10])
+    for seed in range(3):
+        record = model.simulate(8, seed=seed)
+        pair = record["vocalize"], record["sound"]
+        exact, found = last(Exact(model), *pair), last(engine, *pair)
+        assert "parameters" not in found.kept
+        assert abs(float(exact.marginal("responsive").probs[1] - found.marginal("responsive").probs[1])) < 0.03
+        assert abs(float(exact.log_evidence - found.log_evidence)) < 0.1
+    with pytest.raises(ValueOutOfRange, match="nothing to learn"):
+        Variational(Drift()).learn()
+
+
 def test_all_that_is_finite_is_exact():
     model = Drift()
     jumps = torch.tensor([0.5, -1.0, 0.2])
