@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -17,10 +18,12 @@ from apmodels.structure import Structure
 from apmodels.variables import Variable
 from inference.beliefs import FiniteBelief, Marginal
 from inference.engine import Bid, Engine
+from inference.finite_record import along
 from inference.imagining import information_gain
 from inference.known import Known
 from inference.layout import Layout
 from inference.projections import Projections
+from inference.record import Record
 from inference.slices import Axis, Context, Slice, contract
 from inference.table import Rows
 from inference.tabulation import Tabulation
@@ -115,6 +118,10 @@ class Exact(Engine):
         evidence = belief.log_evidence + (evidence[0] if belief.batch is None else evidence)
         kept = self.known.keep(known | actions, seen) if self.known.kept else {}
         return FiniteBelief(self, belief.batch, belief.time + 1, evidence, kept, log_probs)
+
+    def along(self, record: Record, batch: int | None) -> Sequence[FiniteBelief]:
+        """Return the beliefs along a record, of many steps at once where nothing stands against it."""
+        return along(self, record, batch)
 
     def forecast(self, belief: FiniteBelief, action: Any) -> Any:
         """Return the predictive distribution of the next observation, a mixture over the hidden values."""

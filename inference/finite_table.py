@@ -35,13 +35,30 @@ class FiniteTable(Table):
     def ratio(self, rows: Rows, y: Tensor) -> Tensor:
         """Return log p(y | h) - log p(y | baseline), (B, H)."""
         if self.index is None:
+            if isinstance(rows, Tensor):
+                return self._looked_up(rows, y)
             table = self.table[rows]
             return _outcome(table, y[:, None].expand(table.shape[:-1])).sum(-1)
         return summed(_outcome(self.flat_table[rows], y.gather(1, self.flat_index[rows])), self.hypotheses)
 
+    def _looked_up(self, rows: Tensor, y: Tensor) -> Tensor:
+        """The same of a batch: only the outcomes that were seen are read, not the table of every one of it."""
+        elements, outcomes = self.table.shape[2:]
+        cells = (rows[:, None] * elements + torch.arange(elements)) * outcomes
+        if not y.is_floating_point():
+            return torch.nn.functional.embedding_bag(cells + y, self.by_outcome, mode="sum")
+        missing = torch.isnan(y)
+        nothing = len(self.by_outcome) - 1
+        cells = torch.where(missing, nothing, cells + torch.where(missing, 0.0, y).long())
+        return torch.nn.functional.embedding_bag(cells, self.by_outcome, mode="sum", padding_idx=nothing)
+
     def settle(self) -> None:
         """Lay out a sparse table's elements, and after them the baseline's, so that one gather scores both."""
         super().settle()
+        if self.index is None:
+            by_outcome = self.table.permute(0, 2, 3, 1).flatten(0, 2)
+            # And a last row, for what is missing.
+            self.by_outcome = torch.cat([by_outcome, torch.zeros_like(by_outcome[:1])])
         if self.baseline is not None:
             elements = torch.arange(self.baseline.shape[1]).expand(len(self.baseline), -1)
             self.both_index = torch.cat([self.flat_index, elements], 1)
@@ -52,11 +69,15 @@ class FiniteTable(Table):
         if self.baseline is None:
             return super().score(rows, y)
         at = y.gather(1, self.both_index[rows])
-        if isinstance(rows, slice) or at.is_floating_point():
+        if isinstance(rows, slice):
             scores = _outcome(self.both_table[rows], at)
         else:
             # Only the outcomes that were seen are read, not the table of every one of the batch.
-            scores = self.both_table[rows[:, None], torch.arange(at.shape[1]), at]
+            cells = rows[:, None], torch.arange(at.shape[1])
+            missing = torch.isnan(at) if at.is_floating_point() else None
+            at = at if missing is None else torch.where(missing, 0.0, at).long()
+            scores = self.both_table[*cells, at]
+            scores = scores if missing is None else torch.where(missing, 0.0, scores)
         ratio, base = scores.split([self.flat_index.shape[1], y.shape[1]], 1)
         return summed(ratio, self.hypotheses), base.sum(1)
 

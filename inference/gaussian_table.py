@@ -38,6 +38,8 @@ class GaussianTable(Table):
         """Return log p(y | h) - log p(y | baseline), (B, H)."""
         if self.index is None:
             # Centred on the baseline, so that nothing large cancels.
+            if isinstance(rows, Tensor) and len(rows) > 1 and rows.stride(0) == 0:
+                rows = slice(int(rows[0]), int(rows[0]) + 1)
             residual = y - self.location[rows]
             slope, offset = self.slope[rows], self.middle[rows] - self.location[rows][:, None]
             missing = torch.isnan(residual)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -10,8 +11,10 @@ from torch import Tensor
 from apmodels.simulation import Values
 from apmodels.structure import Structure
 from inference.bank import Bank
+from inference.bank_record import along
 from inference.engine import Bid
 from inference.plan import Plan, make_plan
+from inference.record import Record
 from inference.worlds import BankBelief, Step
 
 
@@ -43,6 +46,10 @@ class Hypotheses(Bank):
         rows = len(belief.log_weights)
         actions = self._actions(action, rows)
         return self.advance(belief, actions, self.seen_as(observation, rows))
+
+    def along(self, record: Record, batch: int | None) -> Sequence[BankBelief]:
+        """Return the beliefs along a record, of all steps at once where nothing stands against it."""
+        return along(self, record, batch)
 
     def advance(self, belief: BankBelief, actions: Values, seen: Values) -> BankBelief:
         """The same, of what has been checked: actions (rows, *shape), observations (rows, 1, *shape)."""

@@ -12,6 +12,7 @@ from apmodels.laws import Laws
 from apmodels.simulation import Values
 from apmodels.structure import Structure
 from apmodels.variables import Variable
+from inference.record import alike, folded
 
 Context = dict[tuple[str, int], Tensor]
 
@@ -53,6 +54,25 @@ class Known:
             assert isinstance(law, Tensor)
             known[name] = context[name, 0] = law
         return known, context
+
+    def along(self, actions: Values, seen: Values, steps: int, rows: int) -> tuple[Context, list[Values]]:
+        """Move the known variables along a record, (steps, rows or 1, *shape) by name.
+
+        Returns:
+            Everything known by (name, lag), (steps, rows or 1, *shape), and what is kept after each step.
+        """
+        if not self.kept:
+            wide = max((value.shape[1] for value in actions.values()), default=1)
+            _, context = self.move({}, {n: folded(value, wide) for n, value in actions.items()}, steps * wide)
+            return {key: value.unflatten(0, (steps, wide)) for key, value in context.items()}, [{}] * steps
+        kept, contexts, after = self.first(rows), [], []
+        for t in range(steps):
+            act, see = ({n: v[t].expand(rows, *v.shape[2:]) for n, v in some.items()} for some in (actions, seen))
+            known, context = self.move(kept, act, rows)
+            kept = self.keep(known | act, {name: value.reshape(rows, -1) for name, value in see.items()})
+            contexts.append(context)
+            after.append(kept)
+        return {key: alike(torch.stack([some[key] for some in contexts])) for key in contexts[0]}, after
 
     def keep(self, known: Values, seen: Values) -> Values:
         """Return what later steps ask for, of known values and of observations (B, elements)."""

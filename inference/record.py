@@ -93,7 +93,7 @@ class Record:
         for name, value in self.seen.items():
             value = self._timed(engine, name, value.to(engine.dtype), engine.shown[name], rows)
             # One sum finds both the infinite and the missing.
-            if not math.isfinite(float(value.sum())) and bool(torch.isinf(value).any()):
+            if not math.isfinite(float(value.detach().sum())) and bool(torch.isinf(value).any()):
                 where = engine.labels[name]
                 raise ValueOutOfRange(f"{where} is infinite in some element; observe a number, or NaN if it is missing")
             seen[name] = value
