@@ -75,7 +75,7 @@ class Probe:
             worlds = _ProbedWorlds(self.laws, WORLDS)
             for step in range(STEPS):
                 before = worlds.previous
-                worlds.step({name: model.space(name).sample((WORLDS,)) for name in model.action_names})
+                worlds.step({name: self._action(model, name) for name in model.action_names})
                 if step == 3:
                     self.values, self.previous = worlds.values, before
                 for name, value in (*worlds.values.items(), *before.items()):
@@ -83,6 +83,10 @@ class Probe:
         self.laws_of = worlds.laws_of
         wanted = worlds.asked_for & set(pools)
         self.pools = {name: self._all_values(model, name, pools[name]) for name in wanted}
+
+    def _action(self, model: Any, name: str) -> Tensor:
+        value = model.space(name).sample((WORLDS,))
+        return value.to(self.laws.dtype) if value.is_floating_point() else value
 
     def _all_values(self, model: Any, name: str, found: list[Tensor]) -> Tensor | None:
         """Every value that a variable is known to take, if they may be few; None for a continuum."""

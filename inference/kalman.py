@@ -7,11 +7,11 @@ from typing import Any
 import torch
 
 from apmodels import Model
-from apmodels.simulation import as_dict
 from apmodels.structure import Structure
 from inference.engine import Bid
 from inference.hypotheses import Hypotheses, hypotheses_plan
 from inference.plan import Plan
+from inference.record import Record
 from inference.smoothing import smoothed
 from inference.worlds import BankBelief
 
@@ -34,14 +34,11 @@ class Kalman(Hypotheses):
 
     def smooth(self, actions: Any, observations: Any, batch: int | None = None) -> list[BankBelief]:
         """Return the beliefs about each step of a record, given all of it; see ``filter`` for the arguments."""
-        beliefs = list(self.filter(actions, observations, batch))
-        acts = as_dict(actions, self.model.action_names, "action")
+        beliefs, record = list(self.filter(actions, observations, batch)), Record.of(self, actions, observations)
         rows = 1 if batch is None else batch
-        each = []
-        for t in range(len(beliefs)):
-            at = {name: value.select(value.dim() - len(self.spaces[name].shape) - 1, t) for name, value in acts.items()}
-            each.append(self._actions(at or None, rows))
-        return smoothed(self, self.start(batch), beliefs, each)
+        steps = [record.step(t) for t in range(record.steps)]
+        acts = [self._actions(act, rows) for act, _ in steps]
+        return smoothed(self, self.start(batch), beliefs, acts, [self.seen_as(see, rows) for _, see in steps])
 
     @classmethod
     def bid(cls, structure: Structure) -> Bid:

@@ -6,14 +6,16 @@ import torch
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from pyro.distributions import Normal
+from torch import Tensor
 
 from apmodels import Box, Finite, Model, ValueOutOfRange, action, observation, shift, state, static, window
+from apmodels.probing import Probe
 from apmodels.simulation import as_given
 from inference import Kalman, RaoBlackwell
 from tests.inference.affine_models import affine_models, record_of
 from tests.inference.joint_gaussian import JointGaussian
 from tests.inference.oracle import plain
-from tests.models import LearningToLook
+from tests.models import LearningToLook, RandomWalk
 
 
 class Scenery(Model):
@@ -117,6 +119,11 @@ def assert_moments(law, expected):
     np.testing.assert_allclose(spread, expected[1] if spread.ndim == 2 else np.diag(expected[1]), **EXACT)
 
 
+def assert_probabilities(law, expected):
+    for value, prob in zip(law.values, law.probs, strict=True):
+        assert float(prob) == pytest.approx(expected.get(plain(value), 0.0), abs=1e-6)
+
+
 def assert_agrees(engine, model, actions, seen, action):
     """Everything that a belief says, against the joint."""
     joint, belief = JointGaussian(model, actions, seen), after(engine, actions, seen)
@@ -125,9 +132,7 @@ def assert_agrees(engine, model, actions, seen, action):
         if name != "forgotten":
             assert_moments(belief.marginal(name), joint.moments(name))
     for node in model.structure.planned("enumerated"):
-        expected, law = joint.probabilities(node.name), belief.marginal(node.name)
-        for value, prob in zip(law.values, law.probs, strict=True):
-            assert float(prob) == pytest.approx(expected.get(plain(value), 0.0), abs=1e-6)
+        assert_probabilities(belief.marginal(node.name), joint.probabilities(node.name))
     laws, ahead = engine.forecast(belief, as_given(action)), joint.ahead(action)
     laws = laws if isinstance(laws, dict) else {model.observation_names[0]: laws}
     for name, law in laws.items():
@@ -150,6 +155,41 @@ def test_any_affine_model_is_filtered_like_the_joint_gaussian(model, seed, lose)
         assert float(belief.entropy()) == pytest.approx(joint.entropy(interest), abs=1e-6)
     elif "kind" in model.structure.nodes and "mood" not in model.structure.nodes:
         assert float(belief.entropy(("kind", *interest))) == pytest.approx(joint.entropy(interest, ["kind"]), abs=1e-6)
+
+
+def whole(record):
+    """A list of dicts by name as a dict of tensors whose first dimension is time."""
+    return as_given({name: torch.stack([step[name] for step in record]) for name in record[0]})
+
+
+@settings(QUICK, max_examples=15)
+@given(affine_models(), st.integers(0, 1000))
+def test_any_affine_record_is_smoothed_like_the_joint_gaussian(model, seed):
+    actions, seen = record_of(model, seed, 0.2)
+    engine, joint = Kalman(model, torch.float64), JointGaussian(model, actions, seen)
+    if engine.plan.finite:
+        with pytest.raises(ValueOutOfRange, match="mood cannot be smoothed"):
+            engine.smooth(whole(actions), whole(seen))
+        return
+    for step, belief in enumerate(engine.smooth(whole(actions), whole(seen)), 1):
+        for name in gaussians(model):
+            assert_moments(belief.marginal(name), joint.moments(name, step))
+        if engine.plan.worlds:
+            assert_probabilities(belief.marginal("kind"), joint.probabilities("kind"))
+
+
+@settings(QUICK, max_examples=15)
+@given(affine_models(), st.integers(0, 1000), st.sampled_from([0.0, 0.3]))
+def test_beliefs_along_a_record_are_those_of_one_step_after_another(model, seed, lose):
+    actions, seen = record_of(model, seed, lose)
+    engine = Kalman(model, torch.float64)
+    along = engine.filter(whole(actions), whole(seen))
+    for step in (1, 2, 3):
+        stepped = after(engine, actions[:step], seen[:step])
+        assert float(along[step - 1].log_evidence) == pytest.approx(float(stepped.log_evidence), abs=1e-9)
+        for name in [node.name for node in model.structure.hidden if node.random]:
+            here, there = along[step - 1].marginal(name), stepped.marginal(name)
+            np.testing.assert_allclose(here.mean, there.mean, atol=1e-9)
 
 
 @settings(QUICK, max_examples=15)
@@ -228,3 +268,18 @@ def test_images_that_depend_on_each_other_are_filtered_like_the_joint_gaussian(k
     assert not engine.plan.fields
     joint, belief = assert_agrees(engine, model, actions, seen, actions[0])
     assert float(belief.entropy()) == pytest.approx(joint.entropy(["scene"]), abs=1e-6)
+
+
+class Steered(RandomWalk):
+    """An action that goes through a matrix, in whatever precision the matrix has."""
+
+    gears: Tensor = torch.tensor([0.3, -0.7])
+    push = action(Box(-1.0, 1.0, (2,)))
+
+    @state
+    def position(self, push, prev_position=0.0):
+        return Normal(prev_position + self.gears @ push, self.drift)
+
+
+def test_a_law_that_multiplies_an_action_is_probed_in_double_precision():
+    assert Probe(Steered()).laws.dtype == torch.float64
