@@ -94,11 +94,13 @@ def log_prob_of(distribution: Any, value: Tensor) -> Tensor:
     one of which a part is missing scores NaN.
     """
     base, added = base_of(distribution)
-    if isinstance(base, (Planted, Evidence)) or not value.is_floating_point():
+    if isinstance(base, (Planted, Evidence)):
         return distribution.log_prob(value)
     if not len(base.event_shape):
         scores = elementwise_log_prob(base, value)
         return scores.sum(tuple(range(-added, 0))) if added else scores
+    if not value.is_floating_point():
+        return distribution.log_prob(value)
     missing = torch.isnan(value)
     gone = missing.flatten(-len(distribution.event_shape))
     scores = distribution.log_prob(torch.where(missing, 0.5, value))

@@ -60,9 +60,26 @@ class Planted(TorchDistribution):
 
 def elementwise_log_prob(law: Distribution, value: Tensor) -> Tensor:
     """Return log p of independent elements, nats, 0 where an element is NaN, which means that it is missing."""
+    if type(law).__name__ in ("Bernoulli", "Categorical") and "probs" in vars(law):
+        return _log_chance(law, value)
     if not value.is_floating_point():
         return law.log_prob(value)
     missing = torch.isnan(value)
     # What stands in for them must have a score and a gradient, and 0 and 1 are often at an edge.
     stand_in = 0.0 if law.support.is_discrete else 0.5  # type: ignore[union-attr]
     return torch.where(missing, 0.0, law.log_prob(torch.where(missing, stand_in, value)))
+
+
+def _log_chance(law: Distribution, value: Tensor) -> Tensor:
+    """log p of elements with few outcomes, whose own ``log_prob`` rounds a probability of 0 up."""
+    missing = torch.isnan(value)
+    outcome = torch.where(missing, 0.0, value)
+    if type(law).__name__ == "Bernoulli":
+        chance = torch.where(outcome == 1, law.probs, 1 - law.probs)
+    else:
+        probs = law.probs.expand(*torch.broadcast_shapes(law.probs.shape[:-1], outcome.shape), law.probs.shape[-1])
+        chance = probs.gather(-1, outcome.long().expand(probs.shape[:-1])[..., None])[..., 0]
+    # Where the chance is 0 there is a score, minus infinity, but no gradient.
+    none = chance <= 0
+    score = torch.where(none, 1.0, chance).log().masked_fill(none, -torch.inf)
+    return score.masked_fill(missing, 0.0)
