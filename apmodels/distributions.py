@@ -131,6 +131,9 @@ def check_parameters(distribution: Any, where: str) -> None:
         if constraints.is_dependent(constraint):
             continue
         value = compact(value)
+        good = _at_a_glance(constraint, value)
+        if good is not None and bool(good):
+            continue
         # A NaN passes no constraint but those that ask nothing; an infinite location says nothing either.
         good = constraint.check(value)
         if name == "loc" or name == "probs":
@@ -141,6 +144,18 @@ def check_parameters(distribution: Any, where: str) -> None:
                 f"{where} is {type(base).__name__} with {name} = {bad.flatten()[0]:g}, "
                 f"which is outside {_words(constraint)}"
             )
+
+
+def _at_a_glance(constraint: Any, value: Tensor) -> Tensor | None:
+    """Whether a parameter is surely in range, in an operation or two; None where that takes a closer look."""
+    if not value.numel() or not value.is_floating_point():
+        return None
+    kind = type(constraint).__name__.lstrip("_")
+    if kind == "Real":
+        return torch.isfinite(value.sum())
+    if kind == "GreaterThan" and isinstance(constraint.lower_bound, (int, float)):
+        return value.amin() > constraint.lower_bound
+    return None
 
 
 def _words(constraint: Any) -> str:

@@ -68,24 +68,14 @@ class Laws:
                 )
             return tuple(tensors(template[0]))
 
-        varying = [[value.shape[i] > 1 for value in parents.values()] for i in range(len(lead))]
-        squeezed = [_drop_single(value, len(lead)) for value in parents.values()]
-        function = parts
-        for dims in reversed(varying):
-            if any(dims):
-                function = vmap(function, in_dims=tuple(0 if varies else None for varies in dims))
-        with _default_dtype(self.dtype), unvalidated(), _explained(self.model, variable):
-            results = function(*squeezed)
-        wide = [n if any(dims) else 1 for n, dims in zip(lead, varying, strict=True)]
-        kept = sum(any(dims) for dims in varying)
-        results = [p.reshape((*wide, *p.shape[kept:])).expand((*lead, *p.shape[kept:])) for p in results]
+        results = self._mapped(variable, parts, list(parents.values()), lead)
         law = with_tensors(template[0], results, lead)
         if isinstance(law, Distribution):
             check_parameters(law, f"{type(self.model).__name__}.{name}")
         return law
 
     def score(self, name: str, parents: dict[str, Tensor], value: Tensor, lead: tuple[int, ...]) -> Tensor:
-        """Return log p(value | parents), (*lead,), of a random variable; ``value`` is (*lead, *shape).
+        """Return log p(value | parents), (*lead,), of a random variable; ``value`` and ``parents`` as in :meth:`many`.
 
         Elements that are NaN are missing, and say nothing.
         """
@@ -94,10 +84,22 @@ class Laws:
         def log_prob(value: Tensor, *values: Tensor) -> Tensor:
             return log_prob_of(self._call(variable, dict(zip(parents, values, strict=True))), value)
 
-        worlds = torch.Size(lead).numel()
-        flat = [v.reshape(worlds, *v.shape[len(lead) :]) for v in (value, *parents.values())]
+        (scores,) = self._mapped(variable, lambda *values: (log_prob(*values),), [value, *parents.values()], lead)
+        return scores
+
+    def _mapped(
+        self, variable: Variable, function: Callable, values: list[Tensor], lead: tuple[int, ...]
+    ) -> list[Tensor]:
+        """Call a function of one world in all of them, (*lead, ...), along the dimensions in which something varies."""
+        varying = [[value.shape[i] > 1 for value in values] for i in range(len(lead))]
+        for dims in reversed(varying):
+            if any(dims):
+                function = vmap(function, in_dims=tuple(0 if varies else None for varies in dims))
         with _default_dtype(self.dtype), unvalidated(), _explained(self.model, variable):
-            return vmap(log_prob)(*flat).reshape(lead)
+            results = function(*(_drop_single(value, len(lead)) for value in values))
+        wide = [n if any(dims) else 1 for n, dims in zip(lead, varying, strict=True)]
+        kept = sum(any(dims) for dims in varying)
+        return [p.reshape((*wide, *p.shape[kept:])).expand((*lead, *p.shape[kept:])) for p in results]
 
     def before(self, name: str) -> Any:
         """Return the value of a lagged variable before time began: a tensor, or a Variable that has it."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from pyro.distributions import TorchDistribution
 from torch import Tensor
@@ -70,7 +72,7 @@ def elementwise_log_prob(law: Distribution, value: Tensor) -> Tensor:
     return torch.where(missing, 0.0, law.log_prob(torch.where(missing, stand_in, value)))
 
 
-def _log_chance(law: Distribution, value: Tensor) -> Tensor:
+def _log_chance(law: Any, value: Tensor) -> Tensor:
     """log p of elements with few outcomes, whose own ``log_prob`` rounds a probability of 0 up."""
     missing = torch.isnan(value)
     outcome = torch.where(missing, 0.0, value)

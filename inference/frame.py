@@ -57,9 +57,8 @@ class Frame:
         """Return log p(value) in every world, nats, ``lead``; ``value`` is (B or 1, N or 1, *shape)."""
         parents = {}
         for parent in laws.variables[name].parents:
-            here = _in(laws, self.values[parent.name, parent.lag])
-            parents[parent.argument] = here.expand(*lead, *here.shape[2:])
-        return laws.score(name, parents, value.expand(*lead, *value.shape[2:]), lead)
+            parents[parent.argument] = _in(laws, self.values[parent.name, parent.lag])
+        return laws.score(name, parents, value, lead)
 
 
 def _in(laws: Laws, value: Tensor) -> Tensor:
