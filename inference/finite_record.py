@@ -181,7 +181,9 @@ class _Chain:
         layout = self.layout
         self.single = len(layout.present) == len(layout.previous) == 1 and not early
         if self.single:
-            self.matrices = self.tabulation.transitions(slice(None))[0]
+            matrices = self.tabulation.transitions(slice(None))[0]
+            # A state that does not depend on its past has one row for all of it.
+            self.matrices = matrices.expand(*matrices.shape[:-2], layout.previous[0].size, matrices.shape[-1])
             self.varies = layout.varies(layout.present[0].name)
             self.later = self.matrices[..., : layout.present[0].size, :].contiguous()
 

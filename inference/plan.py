@@ -51,9 +51,10 @@ class _Planner:
         forced |= {node.name for node in structure.planned("sampled") if node.random}
         while True:
             self.algebra = {node.name for node in structure.planned("integrated", "counted")} - forced
+            self.algebra -= self._computed(forced)
             self.finite = self._summable(forced)
             self.worlds = {n.name for n in structure.hidden if n.random and n.name not in self.algebra | self.finite}
-            self.computed = self._computed()
+            self.computed = self._computed(self.worlds)
             missing = self._firsts() - self.worlds
             if not missing:
                 break
@@ -108,13 +109,15 @@ class _Planner:
                 return False
         return not any(arrow.parent in self.algebra for arrow in self.structure.into(name))
 
-    def _computed(self) -> set[str]:
-        members: set[str] = set()
-        for node in self.structure.hidden:
-            parents = {a.parent for a in self.structure.into(node.name) if a.parent in self.hidden}
-            if not node.random and parents - {node.name} <= self.worlds | members:
-                members.add(node.name)
-        return members
+    def _computed(self, valued: set[str]) -> set[str]:
+        """The deterministic variables that follow from those that have values, and from what is known."""
+        members = {node.name for node in self.structure.hidden if not node.random}
+        while True:
+            sources = {name: {a.parent for a in self.structure.into(name)} & self.hidden for name in members}
+            kept = {name for name in members if sources[name] <= valued | members}
+            if kept == members:
+                return members
+            members = kept
 
     def _groups(self, names: set[str]) -> tuple[tuple[str, ...], ...]:
         """Names that depend on each other, or are seen together, in one group."""

@@ -61,7 +61,8 @@ class ScoredBank(Bank):
     def scored(self, batch: int | None, record: tuple, draws: Draws) -> BankBelief:
         """Return the worlds that draws describe, weighed by how probable they make a record, over log q."""
         rows, count = draws.log_prob.shape
-        statics = {name: draws.values[name] for name in self.plan.worlds if self.roles[name] == "static"}
+        values = {name: value.to(self.dtype) for name, value in draws.values.items()}
+        statics = {name: values[name] for name in self.plan.worlds if self.roles[name] == "static"}
         if not statics:
             blank = torch.zeros(rows, count, dtype=self.dtype)
             belief = self.start(batch, {"": blank})
@@ -70,7 +71,7 @@ class ScoredBank(Bank):
         weights = belief.log_weights
         for t, (actions, seen) in enumerate(record):
             step, known = self.step_of(belief, actions)
-            path = {n: draws.values[f"{n}_{t + 1}"] for n in self.plan.worlds if self.roles[n] == "state"}
+            path = {n: values[f"{n}_{t + 1}"] for n in self.plan.worlds if self.roles[n] == "state"}
             self.move(step, path)
             self.sense(step, seen)
             weights = weights + step.prior + step.score

@@ -27,6 +27,7 @@ from inference.amortised import Amortised
 from inference.draws import draw_values
 from inference.engine import Bid, Engine
 from inference.particles import Particles
+from inference.plan import make_plan
 from inference.posterior_draws import Draws, Proposal, proposal
 from inference.rao_blackwell import DepletionWarning, effective
 from inference.scored_bank import ScoredBank
@@ -116,6 +117,9 @@ class Variational(Engine):
             if not arrow.smooth and parent.hidden and parent.values is None:
                 return Bid(0.0, f"{arrow.child} changes in steps with {arrow.parent}: there is no gradient to follow")
         free = [n.name for n in structure.hidden if n.random and n.values is None]
+        for name in set(make_plan(structure, free, scored=True).worlds) - set(free):
+            mixed = next(a.child for a in structure.out_of(name) if not structure.nodes[a.child].random)
+            return Bid(0.0, f"{name} cannot be summed: {mixed} is computed from it and from what is continuous")
         if not free:
             return Bid(0.1, "nothing that is hidden is continuous: there is nothing to fit")
         return Bid(0.3, f"a guide over {', '.join(free)}")
