@@ -13,7 +13,7 @@ from apmodels import ValueOutOfRange
 from apmodels.simulation import Values
 from inference.frame import Frame, Key, Memory
 from inference.passage import WIDEST, Passage, missing, passage
-from inference.record import Beliefs, Later, Record, alike, alone, folded
+from inference.record import Beliefs, Later, Record, alike, folded
 from inference.worlds import BankBelief
 
 # So many numbers of one kind are held at a time; what needs more is led along in pieces.
@@ -27,15 +27,14 @@ def along(engine: Any, record: Record, batch: int | None) -> Beliefs | list[Any]
     belief = engine.start(batch)
     if not _serves(engine, belief) or record.steps < 2:
         return engine.stepwise(belief, record)
-    with alone(len(belief.log_weights) * max(sum(block._width(block.last)) for block in engine.gaussians)):
-        whole = _Whole(engine, record, belief)
-        items: list[Any] = []
-        while len(items) < record.steps:
-            found = whole.piece(belief, len(items))
-            if found is None:
-                return Beliefs([*items, *engine.stepwise(belief, record, len(items))])
-            items += found
-            belief = Beliefs(items[-1:])[0]
+    whole = _Whole(engine, record, belief)
+    items: list[Any] = []
+    while len(items) < record.steps:
+        found = whole.piece(belief, len(items))
+        if found is None:
+            return Beliefs([*items, *engine.stepwise(belief, record, len(items))])
+        items += found
+        belief = Beliefs(items[-1:])[0]
     return Beliefs(items)
 
 
@@ -175,6 +174,8 @@ def _unfolded(part: Tensor, rows: int) -> Tensor:
 def _side_by_side(values: list[Tensor]) -> Tensor:
     """(steps, rows or 1, numbers of all)."""
     rows = max(value.shape[1] for value in values)
+    if len(values) == 1:
+        return _flat(values[0])
     return torch.cat([_flat(value).expand(-1, rows, -1) for value in values], -1)
 
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from inference.frame import Memory
 from inference.gaussian import Gaussian
 from inference.gaussian_block import GaussianBlock
+from inference.record import alone
 from inference.riccati import gains
 
 # Beliefs about more numbers than these gain nothing: their products take longer than calling for them.
@@ -85,11 +86,11 @@ def passage(
     seen = _plus(_columns(value, lead, rows), -base)
     rest = torch.eye(view.shape[-1], dtype=view.dtype) - found.gain @ view
     lead_on, shift, gain = (rest @ matrix).to(dtype), rest @ offset, found.gain.to(dtype)
-    means = _means(first, lead_on[..., kept, :], _plus(gain[..., kept, :] @ seen, shift[..., kept, :]))
+    means = _means(first, lead_on[..., kept, :], gain[..., kept, :], seen, shift[..., kept, :])
     past, after = means[:-1], means[1:]
     if block.first != block.last:
         after = _plus(lead_on[..., last, :] @ past + gain[..., last, :] @ seen, shift[..., last, :])
-    surprise = _plus(seen - (view @ matrix).to(dtype) @ past, -view @ offset)
+    surprise = _plus(((-view @ matrix).to(dtype) @ past).add_(seen), -view @ offset)
     score = _score(surprise, found.root, count)
     covariance = found.covariance
     if block.last != stage.end:
@@ -106,21 +107,26 @@ def missing(value: Tensor) -> Tensor | None:
     return gone[:, :1] if bool((gone == gone[:, :1]).all()) else gone
 
 
-def _means(first: Tensor, lead: Tensor, more: Tensor) -> Tensor:
-    """x_t = lead_t x_{t-1} + more_t, (1 + steps, groups, n, columns), from the first one on."""
-    first, lead, more = (part.squeeze(-3) if len(first) == 1 else part for part in (first, lead, more))
-    product = torch.addmm if first.dim() == 2 else torch.baddbmm
-    x, steps = first, zip(more.unbind(0), lead.unbind(0), strict=True)
-    if torch.is_grad_enabled() and any(part.requires_grad for part in (first, lead, more)):
-        means = [x, *(x := product(more, lead, x) for more, lead in steps)]
-        whole = torch.stack(means)
-    else:
-        whole = first.new_empty(1 + len(more), *first.shape)
-        whole[0] = first
-        places = whole.unbind(0)
-        for t, (more, lead) in enumerate(steps):
-            product(more, lead, places[t], out=places[t + 1])
-    return whole.unsqueeze(1) if first.dim() == 2 else whole
+def _means(first: Tensor, lead: Tensor, gain: Tensor, seen: Tensor, shift: Tensor) -> Tensor:
+    """x_t = lead_t x_{t-1} + gain_t seen_t + shift_t, (1 + steps, groups, n, columns), from the first one on."""
+    if torch.is_grad_enabled() and any(part.requires_grad for part in (first, lead, gain, seen, shift)):
+        more = _plus(gain @ seen, shift)
+        x = first
+        return torch.stack([x, *(x := torch.baddbmm(here, a, x) for here, a in zip(more, lead, strict=True))])
+    whole = first.new_empty(1 + len(gain), *first.shape)
+    whole[0] = first
+    torch.matmul(gain, seen, out=whole[1:])
+    if bool(shift.any()):
+        whole[1:] += shift
+    single = len(first) == 1
+    places, leads = (part.squeeze(1).unbind(0) if single else part.unbind(0) for part in (whole, lead))
+    with alone(first.numel()):
+        for t, matrix in enumerate(leads):
+            if single:
+                places[t + 1].addmm_(matrix, places[t])
+            else:
+                places[t + 1].baddbmm_(matrix, places[t])
+    return whole
 
 
 def _score(surprise: Tensor, root: Tensor, count: Tensor | int) -> Tensor:
@@ -128,7 +134,7 @@ def _score(surprise: Tensor, root: Tensor, count: Tensor | int) -> Tensor:
     unit = torch.eye(root.shape[-1], dtype=root.dtype).expand_as(root)
     white = torch.linalg.solve_triangular(root, unit, upper=False).to(surprise.dtype) @ surprise
     scale = root.diagonal(dim1=-2, dim2=-1).log().sum(-1) + 0.5 * math.log(2 * math.pi) * count
-    return torch.add(-scale[..., None], white.square().sum(-2, dtype=root.dtype), alpha=-0.5)
+    return torch.add(-scale[..., None], white.square_().sum(-2), alpha=-0.5)
 
 
 def _plus(value: Tensor, more: Tensor) -> Tensor:

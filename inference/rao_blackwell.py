@@ -206,7 +206,8 @@ def _meets(structure: Structure, name: str, plan: Plan) -> bool:
 
 def effective(log_weights: Tensor) -> Tensor:
     """Return the effective number of particles, (rows,)."""
-    return (-(2 * log_weights).logsumexp(1)).exp()
+    weights = log_weights.exp()
+    return 1 / (weights * weights).sum(1)
 
 
 def resampled(belief: BankBelief, index: Tensor) -> BankBelief:

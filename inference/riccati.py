@@ -56,6 +56,9 @@ def gains(start: Tensor, matrix: Tensor, noise: Tensor, view: Tensor, blur: Tens
 
 def _spans(start: Tensor, matrix: Tensor, noise: Tensor, view: Tensor, blur: Tensor, kept: Tensor) -> Tensor | None:
     """What is carried after each step, (T, *lead, n, n)."""
+    steps, alike = len(matrix), all(part.stride(0) == 0 for part in (matrix, noise, view, blur))
+    if alike:
+        matrix, noise, view, blur = (part[:1] for part in (matrix, noise, view, blur))
     cross = noise @ view.mT
     root, failed = torch.linalg.cholesky_ex(_symmetric(view @ cross + blur))
     if bool((failed != 0).any()):
@@ -68,10 +71,31 @@ def _spans(start: Tensor, matrix: Tensor, noise: Tensor, view: Tensor, blur: Ten
     told = white.mT @ white
     first = torch.zeros_like(start), start, torch.zeros_like(start)
     begun = _joined(first, (lead[0], spread[0], told[0]))
+    if alike:
+        return _doubled(begun, (lead, spread, told), steps)
     parts = [
         torch.cat([one.expand_as(rest[:1]), rest[1:]]) for one, rest in zip(begun, (lead, spread, told), strict=True)
     ]
     return _scanned(parts[0], parts[1], parts[2])[1]
+
+
+def _doubled(begun: Span, step: Span, steps: int) -> Tensor:
+    """What is carried after each of some steps that are all alike but the first one."""
+    spans = begun[0][None], begun[1][None], begun[2][None]
+    while len(spans[1]) < steps:
+        # All the spans so far, and as many steps as there are of them, with that many more.
+        more = _joined((_with(spans[0], step[0]), _with(spans[1], step[1]), _with(spans[2], step[2])), step)
+        spans = (
+            torch.cat([spans[0], more[0][:-1]]),
+            torch.cat([spans[1], more[1][:-1]]),
+            torch.cat([spans[2], more[2][:-1]]),
+        )
+        step = more[0][-1:], more[1][-1:], more[2][-1:]
+    return spans[1][:steps]
+
+
+def _with(spans: Tensor, step: Tensor) -> Tensor:
+    return torch.cat([spans, step.expand_as(spans[:1])])
 
 
 Span = tuple[Tensor, Tensor, Tensor]
@@ -99,12 +123,12 @@ def _scanned(lead: Tensor, spread: Tensor, told: Tensor) -> Span:
 def _joined(early: Span, late: Span) -> Span:
     """One span of two."""
     size = early[0].shape[-1]
-    both = torch.eye(size, dtype=early[0].dtype) + early[1] @ late[2]
-    lead, spread = torch.linalg.solve_ex(both, torch.cat(torch.broadcast_tensors(early[0], early[1]), -1))[0].split(
-        size, -1
-    )
+    both = early[1] @ late[2]
+    both.diagonal(dim1=-2, dim2=-1).add_(1.0)
+    sides = torch.cat(torch.broadcast_tensors(early[0], early[1]), -1)
+    lead, spread = torch.linalg.solve_ex(both, sides)[0].split(size, -1)
     told = early[0].mT @ late[2] @ lead + early[2]
-    return late[0] @ lead, _symmetric(late[0] @ spread @ late[0].mT + late[1]), _symmetric(told)
+    return late[0] @ lead, late[0] @ spread @ late[0].mT + late[1], told
 
 
 def _alike(one: Tensor, other: Tensor) -> Tensor:

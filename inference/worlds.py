@@ -61,10 +61,12 @@ def even(log_weights: Tensor, count: int, start: Tensor | None = None) -> Tensor
     """Choose worlds at even steps of their weights (systematic sampling), (rows, count)."""
     if start is None:
         start = torch.rand(len(log_weights), 1, dtype=log_weights.dtype)
-    cumulative = log_weights.exp().cumsum(1)
-    steps = (torch.arange(count, dtype=log_weights.dtype) + start) / count
-    found = torch.searchsorted(cumulative, steps * cumulative[:, -1:])
-    return found.clamp(max=log_weights.shape[1] - 1)
+    cumulative = log_weights.exp().cumsum(1, dtype=torch.float64)
+    # How many of the steps lie below the end of each world's share.
+    below = (cumulative / cumulative[:, -1:] * count - start).ceil().clamp(0, count).long()
+    times = torch.diff(below, dim=1, prepend=below.new_zeros(len(below), 1))
+    chosen = torch.repeat_interleave(times.flatten(), output_size=len(below) * count).reshape(-1, count)
+    return chosen - log_weights.shape[1] * torch.arange(len(below))[:, None]
 
 
 def pick(value: Tensor, index: Tensor) -> Tensor:
