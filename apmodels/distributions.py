@@ -132,6 +132,9 @@ def check_parameters(distribution: Any, where: str) -> None:
             continue
         value = compact(value)
         good = _at_a_glance(constraint, value)
+        if _watched is not None:
+            _watched.append(constraint.check(value).all() if good is None else good)
+            continue
         if good is not None and bool(good):
             continue
         # A NaN passes no constraint but those that ask nothing; an infinite location says nothing either.
@@ -152,10 +155,25 @@ def _at_a_glance(constraint: Any, value: Tensor) -> Tensor | None:
         return None
     kind = type(constraint).__name__.lstrip("_")
     if kind == "Real":
-        return torch.isfinite(value.sum())
+        # Of a number that is not finite, nothing is not zero.
+        return value.sum() * 0 == 0
     if kind == "GreaterThan" and isinstance(constraint.lower_bound, (int, float)):
         return value.amin() > constraint.lower_bound
     return None
+
+
+_watched: list[Tensor] | None = None
+
+
+@contextmanager
+def watched() -> Iterator[list[Tensor]]:
+    """Collect whether parameters are in range, each a tensor of one truth value, instead of raising an error."""
+    global _watched
+    before, _watched = _watched, []
+    try:
+        yield _watched
+    finally:
+        _watched = before
 
 
 def _words(constraint: Any) -> str:

@@ -12,7 +12,6 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from apmodels import Model, ValueOutOfRange
-from apmodels.distributions import compact
 from apmodels.simulation import Values
 from apmodels.variables import Variable
 from inference.beliefs import Marginal, Weighted
@@ -26,6 +25,7 @@ from inference.gaussian_block import GaussianBlock, predicted, seen_by
 from inference.known import Known
 from inference.linear import Linear
 from inference.plan import Plan
+from inference.record import narrow
 from inference.worlds import BankBelief, Step, drawn
 
 
@@ -37,6 +37,9 @@ class Bank(Engine):
         plan: which variables have values in the worlds, and how the others are grouped.
         dtype: see Engine.
     """
+
+    # Whether the best of what is drawn is chosen, so that a draw's own probability matters.
+    chooses = False
 
     def __init__(self, model: Model, plan: Plan, dtype: torch.dtype | None = None):
         super().__init__(model, dtype)
@@ -183,7 +186,7 @@ class Bank(Engine):
         """Return a step about to be made, and the known variables."""
         rows = len(belief.log_weights)
         known, context = self.known.move(belief.known, actions, rows)
-        values = {key: _narrow(value)[:, None] for key, value in context.items()}
+        values = {key: narrow(value)[:, None] for key, value in context.items()}
         for name, value in belief.values.items():
             values[name, 0 if self.roles[name] == "static" else 1] = value
         lead = (rows, belief.log_weights.shape[1])
@@ -227,7 +230,9 @@ class Bank(Engine):
             value, score = given, torch.zeros(step.lead)
         elif given is None:
             law, value = step.frame.draw(self.laws, name, step.lead)
-            score = law.log_prob(value) if isinstance(law, Distribution) else torch.zeros(step.lead)
+            score = torch.zeros(())
+            if self.chooses and isinstance(law, Distribution):
+                score = law.log_prob(value)
         else:
             value, score = given, step.frame.score(self.laws, name, given, step.lead)
         step.prior = step.prior + score.to(self.dtype)
@@ -264,20 +269,27 @@ class Bank(Engine):
         for score in scores:
             step.score = step.score + score.to(self.dtype)
 
-    def made(self, belief: BankBelief, step: Step, known: Values, weights: Tensor, seen: Values) -> BankBelief:
-        """Return the belief after a step: ``weights`` (rows, worlds) are log p(world, observation)."""
+    def made(
+        self, belief: BankBelief, step: Step, known: Values, weights: Tensor, seen: Values, kept: Values | None = None
+    ) -> BankBelief:
+        """Return the belief after a step: ``weights`` (rows, worlds) are log p(world, observation).
+
+        ``kept`` is what later steps ask for, where that has been found already.
+        """
         total = weights.logsumexp(1)
         if not bool(torch.isfinite(total).all()):
             raise ValueOutOfRange(f"{type(self.model).__name__} gives what was observed no probability at all")
         names = (*self.plan.worlds, *self.plan.computed)
         values = {n: step.frame.values[n, 0] for n in names if (n, 0) in step.frame.values}
-        flat = {name: value.reshape(len(value), -1) for name, value in seen.items()}
+        if kept is None:
+            flat = {name: value.reshape(len(value), -1) for name, value in seen.items()}
+            kept = self.known.keep(known, flat) if self.known.kept else {}
         return BankBelief(
             engine=self,
             batch=belief.batch,
             time=belief.time + 1,
             log_evidence=belief.log_evidence + (total[0] if belief.batch is None else total),
-            known=self.known.keep(known, flat) if self.known.kept else {},
+            known=kept,
             log_weights=weights - total[:, None],
             values=values,
             gaussian=tuple(step.gaussian),
@@ -285,8 +297,3 @@ class Bank(Engine):
             counts=tuple(step.counts),
             finite=step.finite,
         )
-
-
-def _narrow(value: Tensor) -> Tensor:
-    """Keep one row of what is the same in all of them."""
-    return compact(value) if value.dim() == 1 or (value.shape[0] > 1 and value.stride(0) == 0) else value

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -19,7 +19,9 @@ from inference.bank import Bank
 from inference.engine import Bid, Refusal
 from inference.gaussian import Gaussian
 from inference.plan import Plan, make_plan
+from inference.record import Record
 from inference.rejuvenation import Past, rejuvenated
+from inference.swarm import Swarm
 from inference.worlds import BankBelief, Step, even, pick, take_worlds
 
 # How many values are tried where one particle is kept.
@@ -65,8 +67,10 @@ class RaoBlackwell(Bank):
         # Where nothing must be sampled, all particles are alike.
         particles, candidates = (particles, candidates) if plan.worlds else (1, 1)
         self.particles, self.seed, self.threshold = particles, seed, threshold
-        self.candidates = candidates if particles == 1 else particles
+        self.candidates, self.chooses = (candidates, True) if particles == 1 else (particles, False)
         statics = self.model.declaration.names["static"]
+        self.guide: Any = None
+        self._swarm: Swarm | None = None
         self.sampled_statics = [name for name in self.plan.worlds if name in statics]
 
     def divide(self, structure: Structure, given: str | Iterable[str]) -> Plan:
@@ -157,8 +161,13 @@ class RaoBlackwell(Bank):
         if belief.past is not None:
             drawn = {name: after.values[name] for name in self.plan.worlds if self.roles[name] == "state"}
             after = replace(after, past=belief.past.after(actions, seen, drawn))
-        self._watch(after)
+        self.watched(after)
         return after
+
+    def along(self, record: Record, batch: int | None) -> Sequence[BankBelief]:
+        """Return the beliefs along a record."""
+        self._swarm = self._swarm or Swarm(self)
+        return self._swarm.along(record, batch)
 
     def propagate(self, step: Step, seen: Values) -> Step:
         """Draw the particles' states, and condition on what is seen."""
@@ -166,9 +175,9 @@ class RaoBlackwell(Bank):
         self.sense(step, seen)
         return step
 
-    def refreshed(self, belief: BankBelief) -> BankBelief:
+    def refreshed(self, belief: BankBelief, many: Tensor | None = None) -> BankBelief:
         """Resample where the effective number of particles is low, and rejuvenate what is static."""
-        low = effective(belief.log_weights) < self.threshold * self.particles
+        low = (effective(belief.log_weights) if many is None else many) < self.threshold * self.particles
         if not bool(low.any()):
             return belief
         index = even(belief.log_weights, self.particles)
@@ -189,15 +198,18 @@ class RaoBlackwell(Bank):
         evidence = belief.log_evidence + (total[0] if belief.batch is None else total)
         return replace(after, log_evidence=evidence)
 
-    def _watch(self, belief: BankBelief) -> None:
-        fewest = float(effective(belief.log_weights).min())
+    def watched(self, belief: BankBelief) -> Tensor:
+        """Return the effective number of particles, (rows,), and say so where few carry the weight."""
+        many = effective(belief.log_weights)
+        fewest = float(many.min())
         if fewest < max(2.0, 0.005 * self.particles):
             warnings.warn(
                 f"{type(self.model).__name__}: at step {belief.time} {fewest:.1f} of {self.particles} particles carry "
                 "the weight; use more, or another engine",
                 DepletionWarning,
-                stacklevel=3,
+                stacklevel=4,
             )
+        return many
 
 
 def _meets(structure: Structure, name: str, plan: Plan) -> bool:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from apmodels import ValueOutOfRange
+from apmodels.distributions import compact
 from apmodels.simulation import Values, as_dict
 
 # Up to so many numbers an operation takes less time than it takes to wake a thread.
@@ -109,6 +110,11 @@ def alike(value: Tensor) -> Tensor:
     if value.shape[1] > 1 and (value.stride(1) == 0 or bool((value == value[:, :1]).all())):
         return value[:, :1]
     return value
+
+
+def narrow(value: Tensor) -> Tensor:
+    """Keep one row of (rows, ...) that says itself that all are alike."""
+    return compact(value) if value.dim() == 1 or (value.shape[0] > 1 and value.stride(0) == 0) else value
 
 
 def folded(value: Tensor, rows: int) -> Tensor:

@@ -21,7 +21,8 @@ OPTIONS = {
     "RaoBlackwell": {"particles": 1_000, "dtype": torch.float64},
     "Variational": {"iterations": 200, "draws": 4_000, "dtype": torch.float64},
 }
-few = {"deadline": None, "suppress_health_check": list(HealthCheck), "phases": [Phase.generate]}
+# The same models every time: five standard errors are exceeded once in many thousand comparisons.
+few = {"derandomize": True, "deadline": None, "suppress_health_check": list(HealthCheck), "phases": [Phase.generate]}
 
 
 def hold(model, seed, only):
