@@ -22,6 +22,8 @@ from benchmarks.timing import milliseconds
 from inference import Exact, Kalman, Particles
 
 SERIES, STEPS = 1000, 200
+# So many series that the time goes into arithmetic, and not into asking for it.
+MANY = 8000
 FILTERPY_SERIES = 20
 PARTICLES = 10_000
 REST = 0.02
@@ -83,11 +85,19 @@ def _kalman() -> dict[str, float]:
     spread = np.sqrt(np.diagonal(np.asarray(theirs.filtered_covariances), axis1=-2, axis2=-1))
     one, other, peer = _times(ours, dynamax, filterpy, repeats=20)
     peer *= SERIES / FILTERPY_SERIES
+    many = model.simulate(STEPS, batch=MANY, seed=2)["reading"]
+    wide = jnp.asarray(many.numpy())
+    ours_many, theirs_many = _times(
+        lambda: engine.filter(None, many, batch=MANY), lambda: jax.block_until_ready(compiled(wide)), repeats=9
+    )
     return {
         "kalman_ms": one,
         "kalman_dynamax_ms": other,
         "kalman_filterpy_ms": peer,
         "kalman_vs_dynamax": other / one,
+        "kalman_many_ms": ours_many,
+        "kalman_many_dynamax_ms": theirs_many,
+        "kalman_many_vs_dynamax": theirs_many / ours_many,
         "kalman_vs_filterpy": peer / one,
         "difference.kalman_dynamax_deviations": _largest((means - np.asarray(theirs.filtered_means)) / spread),
         "difference.kalman_dynamax_nats": _largest(beliefs[-1].log_evidence - np.asarray(theirs.marginal_loglik)),
