@@ -38,8 +38,8 @@ class Bank(Engine):
         dtype: see Engine.
     """
 
-    # Whether the best of what is drawn is chosen, so that a draw's own probability matters.
-    chooses = False
+    # Whether the best of what is drawn is chosen, so that a draw's own probability matters; whether worlds all differ.
+    chooses, distinct = False, False
 
     def __init__(self, model: Model, plan: Plan, dtype: torch.dtype | None = None):
         super().__init__(model, dtype)

@@ -9,6 +9,7 @@ import torch
 from pyro.distributions import Beta, Dirichlet, Gamma, MultivariateNormal, Normal
 from torch import Tensor
 
+from apmodels import ValueOutOfRange
 from apmodels.simulation import Values
 from inference.draws import draw_values, function_draws
 from inference.gaussian import Gaussian
@@ -37,7 +38,7 @@ def entropy(engine: Any, belief: Any, names: tuple[str, ...]) -> Tensor:
     outer = tuple(name for name in names if name not in inner)
     worlds = belief.log_weights.shape[1]
     if all(ranged(engine, name) for name in outer):
-        if worlds == 1 or set(engine.plan.worlds) <= set(outer):
+        if worlds == 1 or (engine.distinct and set(engine.plan.worlds) <= set(outer)):
             first = entropy(engine, belief, outer) if outer else torch.zeros(len(belief.log_weights))
             return first.to(engine.dtype) + (belief.log_weights.exp() * _within(engine, belief, inner)).sum(1)
         return _of_mixture(engine, belief, inner, outer)
@@ -82,12 +83,33 @@ def _law(kind: str, counts: Tensor) -> Any:
 def _of_mixture(engine: Any, belief: Any, inner: list[str], outer: tuple[str, ...]) -> Tensor:
     values = draw_values(engine, belief, DRAWS)
     logs = belief.log_weights[:, None] + _density(engine, belief, inner, values)
-    for name in outer:
+    logs = logs + _summed(engine, belief, [name for name in outer if name in engine.plan.finite], values)
+    for name in (name for name in outer if name not in engine.plan.finite):
         # (rows, draws, worlds): whether a world agrees with what was drawn.
         here, there = values[name][:, :, None], belief.values[name][:, None]
         same = (here == there).flatten(3).all(-1) if here.dim() > 3 else here == there
         logs = torch.where(same, logs, -torch.inf)
     return -logs.logsumexp(2).mean(1)
+
+
+def _summed(engine: Any, belief: Any, names: list[str], values: Values) -> Tensor:
+    """log p of drawn values of summed variables in every world, (rows, draws, worlds)."""
+    rows, worlds = belief.log_weights.shape
+    if not names:
+        return torch.zeros(rows, 1, worlds, dtype=engine.dtype)
+    axes = {axis.name: i for i, axis in enumerate(engine.summed.axes)}
+    for name in names:
+        if name not in axes:
+            raise ValueOutOfRange(f"{name} is computed from what is summed: ask for its entropy apart")
+    gone = [i + 2 for name, i in axes.items() if name not in names]
+    logs = belief.finite.logsumexp(gone) if gone else belief.finite
+    cell = torch.zeros(1, 1, dtype=torch.int64)
+    for axis in (axis for axis in engine.summed.axes if axis.name in names):
+        value = values[axis.name].to(axis.values.dtype)
+        same = (flat(value)[:, :, None] == axis.values.reshape(1, 1, axis.size, -1)).all(-1)
+        cell = cell * axis.size + same.to(torch.uint8).argmax(-1)
+    table = logs.expand(rows, worlds, *logs.shape[2:]).flatten(2).mT
+    return table.gather(1, cell.expand(rows, -1)[..., None].expand(-1, -1, worlds))
 
 
 def _density(engine: Any, belief: Any, names: list[str], values: Values) -> Tensor:

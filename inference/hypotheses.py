@@ -21,6 +21,8 @@ from inference.worlds import BankBelief, Step
 class Hypotheses(Bank):
     """Exact beliefs: hypotheses are weighed, and what is continuous is integrated in closed form given each."""
 
+    distinct = True
+
     def people(self, step: Step) -> tuple[Step, Tensor]:
         """Lay out all combinations of the hypotheses' values, with the log of their prior."""
         names = [name for name in self.plan.worlds]

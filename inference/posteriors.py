@@ -133,9 +133,9 @@ def _mixture(belief: Any, parts: list[Any], worlds: int) -> Any:
         counts = cut(counts)
         lead = counts.shape[:-2]
         if kind == "Dirichlet":
-            law = Dirichlet(counts.reshape(*lead, *shape), validate_args=False)
+            law = Dirichlet(counts.reshape((*lead, *shape)), validate_args=False)
         else:
-            first, second = (counts[..., i].reshape(*lead, *shape) for i in (1, 0))
+            first, second = (counts[..., i].reshape((*lead, *shape)) for i in (1, 0))
             if kind == "Gamma":
                 first, second = second, first
             law = (Beta if kind == "Beta" else Gamma)(first, second, validate_args=False)

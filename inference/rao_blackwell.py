@@ -20,7 +20,7 @@ from inference.engine import Bid, Refusal
 from inference.gaussian import Gaussian
 from inference.plan import Plan, make_plan
 from inference.record import Record
-from inference.rejuvenation import Past, rejuvenated
+from inference.rejuvenation import Past, forgotten, rejuvenated
 from inference.swarm import Swarm
 from inference.worlds import BankBelief, Step, even, pick, take_worlds
 
@@ -179,7 +179,9 @@ class RaoBlackwell(Bank):
         """Resample where the effective number of particles is low, and rejuvenate what is static."""
         low = (effective(belief.log_weights) if many is None else many) < self.threshold * self.particles
         if not bool(low.any()):
-            return belief
+            # A finite static's value that no particle has any more is tried again, more and more rarely.
+            lost = belief.past is not None and belief.time.bit_count() == 1 and forgotten(self, belief)
+            return rejuvenated(self, belief, ~low) if lost else belief
         index = even(belief.log_weights, self.particles)
         stay = torch.arange(self.particles).expand(index.shape)
         index = torch.where(low[:, None], index, stay)
@@ -192,7 +194,11 @@ class RaoBlackwell(Bank):
         total = weights.logsumexp(1)
         if not bool(torch.isfinite(total).all()):
             raise ValueOutOfRange(f"{type(self.model).__name__} gives what was observed no probability at all")
-        best = (weights + step.prior).argmax(1, keepdim=True)
+        prior = step.prior
+        if not belief.time and self.sampled_statics:
+            statics = {name: belief.values[name] for name in self.sampled_statics}
+            prior = prior + self.replay_start(belief.batch, statics).log_weights
+        best = (weights + prior).argmax(1, keepdim=True)
         only = take_worlds(step, best)
         after = self.made(belief, only, known, torch.zeros(len(best), 1, dtype=self.dtype), seen)
         evidence = belief.log_evidence + (total[0] if belief.batch is None else total)

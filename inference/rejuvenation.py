@@ -77,6 +77,17 @@ def rejuvenated(engine: Any, belief: BankBelief, rows: Tensor) -> BankBelief:
     )
 
 
+def forgotten(engine: Any, belief: BankBelief) -> bool:
+    """Tell whether some row has no particle any more with some value of a finite static."""
+    for name in engine.sampled_statics:
+        listed = engine.structure.nodes[name].values
+        if listed is not None and len(listed) <= engine.particles:
+            value, wanted = flat(belief.values[name]), listed.reshape(1, 1, len(listed), -1)
+            if not bool((value[:, :, None] == wanted).all(-1).any(1).all()):
+                return True
+    return False
+
+
 def _blocks(engine: Any) -> list[tuple[str, ...]]:
     """What is moved together: all continuous statics, and each finite one."""
     finite = [name for name in engine.sampled_statics if engine.structure.nodes[name].values is not None]
@@ -101,10 +112,13 @@ def _replayed(engine: Any, belief: BankBelief, statics: Values, record: list) ->
 def _proposal(engine: Any, belief: BankBelief, now: Values, names: tuple[str, ...]) -> tuple[Values, Tensor]:
     """New values, and the log of how much likelier the way back is than the way there, (rows, worlds)."""
     lead = belief.log_weights.shape
-    if engine.structure.nodes[names[0]].values is not None:
+    listed = engine.structure.nodes[names[0]].values
+    if listed is not None:
         value = now[names[0]].expand(*lead, *now[names[0]].shape[2:])
-        other = pick(value, torch.randint(lead[1], lead))
-        here, there = (_share(value, v) for v in (value, other))
+        # Half of them what others have, and half any value at all: one that all have lost may be right in the end.
+        any_value = listed.to(value.dtype)[torch.randint(len(listed), lead)]
+        other = _where(torch.rand(lead) < 0.5, any_value, pick(value, torch.randint(lead[1], lead)))
+        here, there = (_share(value, v) + 1 / len(listed) for v in (value, other))
         return {names[0]: other}, here.log() - there.log()
     ways = {name: _unbounded(engine, name) for name in names}
     free = {name: flat(ways[name].inv(now[name])) for name in names}
