@@ -145,7 +145,7 @@ def check_parameters(distribution: Any, where: str) -> None:
             bad = value[~good] if good.shape == value.shape else value[~good].flatten()
             raise ValueOutOfRange(
                 f"{where} is {type(base).__name__} with {name} = {bad.flatten()[0]:g}, "
-                f"which is outside {_words(constraint)}"
+                f"which is outside {words(constraint)}"
             )
 
 
@@ -176,13 +176,19 @@ def watched() -> Iterator[list[Tensor]]:
         _watched = before
 
 
-def _words(constraint: Any) -> str:
+def words(constraint: Any) -> str:
+    """Say which values a constraint allows."""
+    kind = type(constraint).__name__.lstrip("_")
+    if kind == "IntegerInterval":
+        return f"the whole numbers from {constraint.lower_bound} to {constraint.upper_bound}"
     named = {
         "Interval": "[0, 1]",
+        "Boolean": "0 and 1",
         "GreaterThan": "the positive numbers",
         "GreaterThanEq": "the numbers from 0 up",
+        "IntegerGreaterThan": "the whole numbers from 0 up",
         "Simplex": "the probabilities that sum to 1",
         "Real": "the finite numbers",
         "IndependentConstraint": "the finite numbers",
     }
-    return named.get(type(constraint).__name__.lstrip("_"), str(constraint))
+    return named.get(kind, str(constraint))

@@ -99,36 +99,43 @@ def fitted(law: Tensor | Distribution, value: Tensor, batch: int, where: str) ->
     return value.expand(batch, *shape)
 
 
-def as_dict(values: Any, names: list[str], what: str) -> Values:
-    """Return what a user gave for several variables as a dict: None for none, a tensor for one, a dict for more."""
+def as_dict(values: Any, names: list[str], what: str, dtype: torch.dtype | None = None) -> Values:
+    """Return what a user gave for several variables as a dict: None for none, a tensor for one, a dict for more.
+
+    Numbers that are no arrays yet are read with ``dtype`` where they have a fraction.
+    """
     if not names:
         if values is not None and values != {}:
             raise ValueOutOfRange(f"this model has no {what}; pass None")
         return {}
     # The commonest cases first: looking whether a number is a mapping takes longer than a step of the loop may.
-    if len(names) == 1 and isinstance(values, (Tensor, int, float)):
+    if len(names) == 1 and isinstance(values, (Tensor, int)):
         return {names[0]: torch.as_tensor(values)}
     if isinstance(values, Mapping):
         unknown = [name for name in values if name not in names]
         missing = [name for name in names if name not in values]
         if unknown or missing:
             raise ValueOutOfRange(f"the {what}s are {names}; unknown: {unknown}, missing: {missing}")
-        return {name: _as_tensor(values[name], f"{what} {name}") for name in names}
+        return {name: _as_tensor(values[name], what, name, dtype) for name in names}
     if values is None:
         raise ValueOutOfRange(f"an {what} is needed: {names}")
     if len(names) > 1:
         raise ValueOutOfRange(f"this model has several {what}s; pass a dict by name: {names}")
-    return {names[0]: _as_tensor(values, f"{what} {names[0]}")}
+    return {names[0]: _as_tensor(values, what, names[0], dtype)}
 
 
-def _as_tensor(value: Any, what: str) -> Any:
+def _as_tensor(value: Any, what: str, name: str, dtype: torch.dtype | None) -> Any:
+    if isinstance(value, Tensor):
+        return value
     # A name, of a finite space that has names, is for the space to read.
-    if isinstance(value, str):
+    if isinstance(value, str) and what == "action":
         return value
     try:
-        return torch.as_tensor(value)
+        found = torch.as_tensor(value)
+        plain = not hasattr(value, "dtype") and found.is_floating_point()
+        return torch.as_tensor(value, dtype=dtype) if plain and dtype is not None else found
     except (TypeError, ValueError, RuntimeError):
-        raise ValueOutOfRange(f"the {what} is {value!r}, and no number or array of numbers") from None
+        raise ValueOutOfRange(f"the {what} {name} is {value!r}, and no number or array of numbers") from None
 
 
 def as_given(values: Values) -> Any:

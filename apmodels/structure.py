@@ -27,7 +27,7 @@ from torch import Tensor
 
 from apmodels.distributions import family
 from apmodels.probing import Probe
-from apmodels.supports import support_of
+from apmodels.supports import limits_of, support_of
 from apmodels.variables import Parent, Variable
 
 GAUSSIAN = ("Normal", "MultivariateNormal")
@@ -49,6 +49,8 @@ class Node:
     values: Tensor | None
     plan: str
     why: str
+    # The constraint on every element, of a random variable that cannot have all real values; else None.
+    limits: Any = None
 
     @property
     def random(self) -> bool:
@@ -211,7 +213,7 @@ class _Reader:
         shape = tuple(law.shape if isinstance(law, Tensor) else law.event_shape)
         values = None if isinstance(law, Tensor) else support_of(law)
         plan, why = self._plan(variable)
-        return Node(name, variable.role, self._family(name), shape, values, plan, why)
+        return Node(name, variable.role, self._family(name), shape, values, plan, why, limits_of(law))
 
     def _plan(self, variable: Variable) -> tuple[str, str]:
         name = variable.name

@@ -6,12 +6,22 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.distributions import Distribution
+from torch.distributions import Categorical, Distribution, constraints
 
 from apmodels.distributions import base_of
 from apmodels.evidence import Evidence
 
 LARGEST_SUPPORT = 4096
+
+
+def limits_of(law: Any) -> Any:
+    """Return the constraint on every element of a draw that a law has whatever its parameters, or None."""
+    if not isinstance(law, Distribution) or isinstance(law, Evidence):
+        return None
+    base, _ = base_of(law)
+    fixed = not constraints.is_dependent(getattr(type(base), "support", constraints.dependent))
+    support: Any = base.support if fixed or isinstance(base, Categorical) else None
+    return None if support is None or support.event_dim or support is constraints.real else support
 
 
 def support_of(law: Any) -> Tensor | None:

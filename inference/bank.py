@@ -269,6 +269,15 @@ class Bank(Engine):
         for score in scores:
             step.score = step.score + score.to(self.dtype)
 
+    def total(self, weights: Tensor, frame: Frame) -> Tensor:
+        """Return the log of the sum of log weights (rows, worlds), (rows,); ValueOutOfRange where that is nothing."""
+        total = weights.logsumexp(1)
+        if not bool(torch.isfinite(total).all()):
+            free = [name for name in self.model.observation_names if name not in self.owner]
+            frame.check(self.laws, [name for name in free if self.structure.nodes[name].family != "Evidence"])
+            raise ValueOutOfRange(f"{type(self.model).__name__} gives what was observed no probability at all")
+        return total
+
     def made(
         self, belief: BankBelief, step: Step, known: Values, weights: Tensor, seen: Values, kept: Values | None = None
     ) -> BankBelief:
@@ -276,9 +285,7 @@ class Bank(Engine):
 
         ``kept`` is what later steps ask for, where that has been found already.
         """
-        total = weights.logsumexp(1)
-        if not bool(torch.isfinite(total).all()):
-            raise ValueOutOfRange(f"{type(self.model).__name__} gives what was observed no probability at all")
+        total = self.total(weights, step.frame)
         names = (*self.plan.worlds, *self.plan.computed)
         values = {n: step.frame.values[n, 0] for n in names if (n, 0) in step.frame.values}
         if kept is None:

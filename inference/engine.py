@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from apmodels import Model, ValueOutOfRange
+from apmodels.distributions import words
 from apmodels.laws import Laws
 from apmodels.simulation import Values, as_dict
 from apmodels.structure import Structure
@@ -128,7 +129,7 @@ class Engine(ABC):
     def _actions(self, action: Any, batch: int) -> Values:
         if type(action) is int and batch == 1 and action in self._numbers:
             return self._numbers[action]
-        given = as_dict(action, self.model.action_names, "action")
+        given = as_dict(action, self.model.action_names, "action", self.dtype)
         checked = {}
         for name, value in given.items():
             space = self.spaces[name]
@@ -139,7 +140,7 @@ class Engine(ABC):
 
     def _observations(self, observation: Any, batch: int) -> Values:
         seen = {}
-        for name, value in as_dict(observation, self.model.observation_names, "observation").items():
+        for name, value in as_dict(observation, self.model.observation_names, "observation", self.dtype).items():
             value = value if value.dtype == self.dtype else value.to(self.dtype)
             value = self._batched(name, value, self.shown[name], batch)
             seen[name] = value if value.dim() == 2 else value.reshape(batch, -1)
@@ -155,8 +156,20 @@ class Engine(ABC):
             if not bool(finite.all()):
                 where = self.labels[name]
                 raise ValueOutOfRange(f"{where} is infinite in some element; observe a number, or NaN if it is missing")
+            self.check_limits(name, value)
             shaped[name] = value[:, None]
         return shaped
+
+    def check_limits(self, name: str, value: Tensor) -> None:
+        """Raise ValueOutOfRange for an observation (..., *shape) that its law never gives, whatever its parameters."""
+        limits = self.structure.nodes[name].limits
+        if limits is None:
+            return
+        good = limits.check(value) | torch.isnan(value)
+        if not bool(good.all()):
+            family = self.structure.nodes[name].family
+            bad = f"{value[~good].flatten()[0]:g}"
+            raise ValueOutOfRange(f"{self.labels[name]} is {bad}, which no {family} gives: {words(limits)}")
 
     def _batched(self, name: str, value: Tensor, shape: tuple[int, ...], batch: int) -> Tensor:
         if value.shape == shape:

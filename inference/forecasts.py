@@ -14,6 +14,9 @@ from apmodels.distributions import tensors, with_tensors
 from inference.gaussian_block import predicted
 from inference.worlds import BankBelief, Step
 
+# The pseudo-count that stands for certainty: more of it is lost to rounding.
+CERTAIN = 1e8
+
 
 def forecast(engine: Any, belief: BankBelief, action: Any) -> Any:
     """Return the predictive distribution of the next observation; a dict by name where there are several."""
@@ -78,11 +81,10 @@ def _counted(block: Any, counts: Tensor, step: Step, name: str, shape: tuple[int
     found = wide.gather(2, at)
     told = (index >= 0)[..., None]
     if block.kind == "Gamma":
-        size = torch.where(told[..., 0], found[..., 0], 1e6)
-        rate = torch.where(told[..., 0], found[..., 1], 1e6 / alone[..., 0].clamp(min=1e-12))
-        law: Any = NegativeBinomial(
-            size.reshape(*lead, *shape).to(dtype), (1 / (1 + rate)).reshape(*lead, *shape).to(dtype)
-        )
+        # A Poisson variable of a known rate is one of a Gamma that is all but certain; single precision is too coarse.
+        size = torch.where(told[..., 0], found[..., 0].double(), CERTAIN)
+        rate = torch.where(told[..., 0], found[..., 1].double(), CERTAIN / alone[..., 0].double().clamp(min=1e-12))
+        law: Any = NegativeBinomial(size.reshape(*lead, *shape), (1 / (1 + rate)).reshape(*lead, *shape))
     else:
         mean = found / found.sum(-1, keepdim=True)
         if block.kind == "Beta":

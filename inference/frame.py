@@ -60,6 +60,11 @@ class Frame:
             parents[parent.argument] = _in(laws, self.values[parent.name, parent.lag])
         return laws.score(name, parents, value, lead)
 
+    def check(self, laws: Laws, names: Iterable[str]) -> None:
+        """Raise ValueOutOfRange, naming the law, where a parameter is out of range, which scoring does not look at."""
+        for name in names:
+            self.in_all(laws, name, self.lead([(p.name, p.lag) for p in laws.variables[name].parents]))
+
 
 def _in(laws: Laws, value: Tensor) -> Tensor:
     return value.to(laws.dtype) if value.is_floating_point() else value

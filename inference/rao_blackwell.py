@@ -191,9 +191,7 @@ class RaoBlackwell(Bank):
 
     def _best(self, belief: BankBelief, step: Step, known: Values, weights: Tensor, seen: Values) -> BankBelief:
         """Keep the one value that scores best, by its prior and by what was seen (thesis eq. 6.7)."""
-        total = weights.logsumexp(1)
-        if not bool(torch.isfinite(total).all()):
-            raise ValueOutOfRange(f"{type(self.model).__name__} gives what was observed no probability at all")
+        total = self.total(weights, step.frame)
         prior = step.prior
         if not belief.time and self.sampled_statics:
             statics = {name: belief.values[name] for name in self.sampled_statics}

@@ -60,8 +60,8 @@ class Record:
     @classmethod
     def of(cls, engine: Any, actions: Any, observations: Any) -> Record:
         """Read what a user gave."""
-        acts = as_dict(actions, engine.model.action_names, "action")
-        seen = as_dict(observations, engine.model.observation_names, "observation")
+        acts = as_dict(actions, engine.model.action_names, "action", engine.dtype)
+        seen = as_dict(observations, engine.model.observation_names, "observation", engine.dtype)
         shapes = {name: space.shape for name, space in engine.spaces.items()} | engine.shown
         # A record without a batch dimension goes for the whole batch.
         at = {name: value.dim() - len(shapes[name]) - 1 for name, value in (acts | seen).items()}
@@ -97,6 +97,7 @@ class Record:
             if not math.isfinite(float(value.detach().sum())) and bool(torch.isinf(value).any()):
                 where = engine.labels[name]
                 raise ValueOutOfRange(f"{where} is infinite in some element; observe a number, or NaN if it is missing")
+            engine.check_limits(name, value)
             seen[name] = value
         return actions, seen
 

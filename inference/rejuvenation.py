@@ -118,7 +118,7 @@ def _proposal(engine: Any, belief: BankBelief, now: Values, names: tuple[str, ..
         # Half of them what others have, and half any value at all: one that all have lost may be right in the end.
         any_value = listed.to(value.dtype)[torch.randint(len(listed), lead)]
         other = _where(torch.rand(lead) < 0.5, any_value, pick(value, torch.randint(lead[1], lead)))
-        here, there = (_share(value, v) + 1 / len(listed) for v in (value, other))
+        here, there = (_share(value, listed, v) + 1 / len(listed) for v in (value, other))
         return {names[0]: other}, here.log() - there.log()
     ways = {name: _unbounded(engine, name) for name in names}
     free = {name: flat(ways[name].inv(now[name])) for name in names}
@@ -148,12 +148,19 @@ def _slope(way: Any, free: Tensor) -> Tensor:
     return slope.flatten(2).sum(-1) if slope.dim() > 2 else slope
 
 
-def _share(values: Tensor, wanted: Tensor) -> Tensor:
+def _share(values: Tensor, listed: Tensor, wanted: Tensor) -> Tensor:
     """How large a share of the particles of its row has each wanted value, (rows, worlds)."""
-    same = (values[:, None] == wanted[:, :, None]).flatten(3).all(-1) if values.dim() > 2 else None
-    if same is None:
-        same = values[:, None] == wanted[:, :, None]
-    return same.double().mean(2)
+    have, want = (_places(listed, value) for value in (values, wanted))
+    counts = torch.zeros(len(have), len(listed), dtype=torch.float64).scatter_add(
+        1, have, torch.ones(have.shape, dtype=torch.float64)
+    )
+    return counts.gather(1, want) / have.shape[1]
+
+
+def _places(listed: Tensor, values: Tensor) -> Tensor:
+    """Which of some values each particle has, (rows, worlds)."""
+    same = flat(values)[:, :, None] == listed.reshape(1, 1, len(listed), -1)
+    return same.all(-1).to(torch.uint8).argmax(-1)
 
 
 def _where(chosen: Tensor, yes: Tensor, no: Tensor) -> Tensor:

@@ -180,7 +180,12 @@ class Variational(Engine):
         if "posterior" not in belief.kept:
             # A parameter store of its own: a user's other guides stay as they are.
             with pyro.get_param_store().scope(), seeded(self.seed * 1_000_003 + belief.time):
-                belief.kept["posterior"] = self._weighed(belief, self._fitted(belief))
+                try:
+                    guide = self._fitted(belief)
+                except ValueError as error:
+                    # Pyro appends a table of shapes.
+                    raise ValueOutOfRange(str(error).split("\n")[0]) from error
+                belief.kept["posterior"] = self._weighed(belief, guide)
         return belief.kept["posterior"]
 
     def _fitted(self, belief: VariationalBelief) -> Proposal | None:

@@ -591,3 +591,28 @@ def test_what_no_hypothesis_tells_apart_has_no_statistic():
     engine = Exact(Toss(), torch.float64)
     with pytest.raises(ValueError, match="bears on its hypotheses"):
         engine.statistic(engine.start())
+
+
+class Kettle(Model):
+    """Drops fall at a known rate or at one that is not."""
+
+    @static
+    def known(self):
+        return Bernoulli(0.5)
+
+    @static
+    def rate(self):
+        return Gamma(2.0, 1.0)
+
+    @observation
+    def drops(self, known, rate):
+        return Poisson(where(known == 1, 20.0, rate))
+
+    interest = known
+
+
+@pytest.mark.parametrize("drops", [0.0, 3.0, 40.0])
+def test_the_forecast_of_a_known_rate_beside_a_counted_one_is_what_the_evidence_says(drops):
+    engine = Exact(Kettle(), torch.float64)
+    said = engine.forecast(engine.start(), None).log_prob(torch.tensor(drops))
+    assert float(said) == pytest.approx(float(engine.update(engine.start(), None, drops).log_evidence), abs=1e-5)

@@ -352,31 +352,8 @@ def updated(engine, belief, action, observed):
         return after, float(after.log_evidence)
 
 
-BELLS = "no value of a bell", "no value of a bell either"
-# What is known to be otherwise as yet.
-OTHERWISE = {
-    **{(made, "a word"): "a word for an observation in a dict is an AttributeError" for made in MADE},
-    **{
-        (made, bell): "an observation outside its law's support is scored as if it were another"
-        for made in MADE
-        for bell in BELLS
-        if made != "Exact"
-    },
-    **{("Variational", bell): "the error is Pyro's own" for bell in BELLS},
-    ("Particles", "a law out of range"): "the sentence speaks of what was observed, and not of the law",
-    ("Variational", "a law out of range"): "Pyro appends its table of shapes to the sentence",
-}
-
-
-def calls():
-    for made in MADE:
-        for wrong in WRONG:
-            reason = OTHERWISE.get((made, wrong))
-            marks = [pytest.mark.xfail(strict=True, reason=reason)] if reason else []
-            yield pytest.param(made, wrong, marks=marks, id=f"{made}, {wrong}")
-
-
-@pytest.mark.parametrize(("made", "wrong"), list(calls()))
+@pytest.mark.parametrize("made", MADE)
+@pytest.mark.parametrize("wrong", WRONG)
 def test_a_bad_call_is_out_of_range_and_harms_nothing(made, wrong):
     make, name = MADE[made]
     engine = make()
@@ -493,8 +470,6 @@ UNCOUNTABLE = [
 ]
 
 
-# One between two others is scored as one of them; one beyond them is an error of PyTorch's own.
-@pytest.mark.xfail(strict=True, reason="no bank of worlds looks whether an outcome can be")
 @pytest.mark.parametrize("kind", [Exact, Particles])
 @pytest.mark.parametrize(("name", "value"), [*UNCOUNTABLE, ("drops", -1.0)])
 def test_an_outcome_outside_its_support_is_named(kind, name, value):
