@@ -18,9 +18,9 @@ from apmodels import ValueOutOfRange
 from apmodels.errors import nearest
 from experiments.agreement_models import models
 from experiments.study import Result
+from inference.brute_force.reference import reference
 from inference.check import compare, simulated
 from inference.choose import ENGINES, bids
-from inference.reference import reference
 
 # A quick look has fewer particles, and shorter fits.
 QUICK = {"RaoBlackwell": {"particles": 4000}, "Particles": {"particles": 4000}, "Variational": {"iterations": 80}}

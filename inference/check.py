@@ -15,9 +15,9 @@ from torch import Tensor
 from apmodels import Model, ValueOutOfRange
 from apmodels.simulation import Values, as_given, seeded
 from inference.beliefs import Marginal
+from inference.brute_force.reference import WORLDS, Reference, reference
 from inference.choose import ENGINES, bids
 from inference.engine import Refusal
-from inference.reference import WORLDS, Reference, reference
 
 # What each engine is built with, and how far it may be off: of a probability, or of a mean in standard deviations.
 OPTIONS: dict[str, dict[str, Any]] = {

@@ -10,10 +10,10 @@ from apmodels import Model
 from apmodels.structure import Structure
 from inference.engine import Bid
 from inference.exact import Exact
-from inference.hypotheses import Hypotheses, hypotheses_plan
-from inference.plan import Plan
-from inference.statistic import Statistic, statistic
-from inference.worlds import BankBelief
+from inference.worlds.hypotheses import Hypotheses, hypotheses_plan
+from inference.worlds.plan import Plan
+from inference.worlds.statistic import Statistic, statistic
+from inference.worlds.step import BankBelief
 
 
 class Counting(Hypotheses):

@@ -16,7 +16,7 @@ from apmodels.laws import Laws
 from apmodels.simulation import Values, as_dict
 from apmodels.structure import Structure
 from inference.beliefs import Belief
-from inference.record import Record
+from inference.records.record import Record
 
 
 class Refusal(TypeError):

@@ -18,15 +18,15 @@ from apmodels.structure import Structure
 from apmodels.variables import Variable
 from inference.beliefs import FiniteBelief, Marginal
 from inference.engine import Bid, Engine
-from inference.finite_record import along
-from inference.imagining import information_gain
-from inference.known import Known
-from inference.layout import Layout
-from inference.projections import Projections
-from inference.record import Record
-from inference.slices import Axis, Context, Slice, contract
-from inference.table import Rows
-from inference.tabulation import Tabulation
+from inference.records.finite_record import along
+from inference.records.record import Record
+from inference.tables.imagining import information_gain
+from inference.tables.layout import Layout
+from inference.tables.projections import Projections
+from inference.tables.slices import Axis, Context, Slice, contract
+from inference.tables.table import Rows
+from inference.tables.tabulation import Tabulation
+from inference.worlds.known import Known
 
 
 class Exact(Engine):

@@ -9,11 +9,11 @@ import torch
 from apmodels import Model
 from apmodels.structure import Structure
 from inference.engine import Bid
-from inference.hypotheses import Hypotheses, hypotheses_plan
-from inference.plan import Plan
-from inference.record import Record
-from inference.smoothing import smoothed
-from inference.worlds import BankBelief
+from inference.records.record import Record
+from inference.worlds.hypotheses import Hypotheses, hypotheses_plan
+from inference.worlds.plan import Plan
+from inference.worlds.smoothing import smoothed
+from inference.worlds.step import BankBelief
 
 
 class Kalman(Hypotheses):

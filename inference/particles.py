@@ -11,12 +11,12 @@ from torch import Tensor
 from apmodels import Model
 from apmodels.simulation import Values
 from apmodels.structure import Structure
-from inference.bank import Bank
 from inference.engine import Bid
-from inference.gaussian import Gaussian
-from inference.plan import Plan, make_plan
 from inference.rao_blackwell import RaoBlackwell
-from inference.worlds import Step, drawn, flat
+from inference.worlds.bank import Bank
+from inference.worlds.gaussian import Gaussian
+from inference.worlds.plan import Plan, make_plan
+from inference.worlds.step import Step, drawn, flat
 
 
 class Particles(RaoBlackwell):

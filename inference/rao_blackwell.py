@@ -15,14 +15,14 @@ from apmodels import Model, ValueOutOfRange
 from apmodels.errors import nearest
 from apmodels.simulation import Values, seeded
 from apmodels.structure import Structure
-from inference.bank import Bank
 from inference.engine import Bid, Refusal
-from inference.gaussian import Gaussian
-from inference.plan import Plan, make_plan
-from inference.record import Record
-from inference.rejuvenation import Past, forgotten, rejuvenated
-from inference.swarm import Swarm
-from inference.worlds import BankBelief, Step, even, pick, take_worlds
+from inference.records.record import Record
+from inference.records.swarm import Swarm
+from inference.worlds.bank import Bank
+from inference.worlds.gaussian import Gaussian
+from inference.worlds.plan import Plan, make_plan
+from inference.worlds.rejuvenation import Past, forgotten, rejuvenated
+from inference.worlds.step import BankBelief, Step, even, pick, take_worlds
 
 # How many values are tried where one particle is kept.
 CANDIDATES = 256

@@ -23,16 +23,16 @@ from torch import Tensor
 from apmodels import Model, ValueOutOfRange
 from apmodels.simulation import Values, as_given, seeded
 from apmodels.structure import Structure
-from inference.amortised import Amortised
-from inference.draws import draw_values
+from inference.answers.draws import draw_values
 from inference.engine import Bid, Engine
+from inference.guides.amortised import Amortised
+from inference.guides.posterior_draws import Draws, Proposal, proposal
+from inference.guides.variational_belief import VariationalBelief, line
 from inference.particles import Particles
-from inference.plan import make_plan
-from inference.posterior_draws import Draws, Proposal, proposal
 from inference.rao_blackwell import DepletionWarning, effective
-from inference.scored_bank import ScoredBank
-from inference.variational_belief import VariationalBelief, line
-from inference.worlds import BankBelief
+from inference.worlds.plan import make_plan
+from inference.worlds.scored_bank import ScoredBank
+from inference.worlds.step import BankBelief
 
 GUIDES = {"full": AutoMultivariateNormal, "diagonal": AutoNormal}
 # The draws are weighed, and taken anew where their weights say, until this share is effective, or so many times.

@@ -10,9 +10,9 @@ from scipy import stats
 import inference
 from apmodels import ValueOutOfRange
 from inference import Exact, Kalman, Refusal
+from inference.brute_force.reference import reference
+from inference.brute_force.weighed_worlds import drawn, gridded
 from inference.check import simulated
-from inference.reference import reference
-from inference.weighed_worlds import drawn, gridded
 from tests.inference.oracle import Oracle, plain
 from tests.models import Coin, Contingency, Coupled, RandomWalk, Tracking
 

@@ -12,7 +12,7 @@ from scipy import stats
 from apmodels import Binary, Box, Finite, Model, action, observation, state, static, where
 from apmodels.simulation import as_given
 from inference import Exact
-from inference.record import Record
+from inference.records.record import Record
 from tests.inference.rates_quadrature import Quadrature, counted, grid, interval, rolled, tossed, triangle
 from tests.models import Contingency
 

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from apmodels.simulation import as_given
 from inference import DepletionWarning, RaoBlackwell, Variational
+from inference.brute_force.reference import reference
 from inference.check import error_of, simulated
 from inference.choose import ENGINES, bids
 from inference.rao_blackwell import effective
-from inference.reference import reference
 from tests.inference.affine_models import affine_models
 from tests.inference.test_exact_random import models
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from pyro.distributions import Bernoulli, Categorical, Normal, Poisson
 
-import inference.contexts
+import inference.tables.contexts
 from apmodels import (
     Box,
     CountModel,
@@ -256,7 +256,7 @@ class Counting(Model):
 def test_tables_may_start_again(monkeypatch):
     """Known values without end are as good as a continuum, of which not all are kept."""
     kept = engine_of(Counting()).filter(None, torch.arange(12.0) / 2)[-1]
-    monkeypatch.setattr(inference.contexts, "MOST", 5)
+    monkeypatch.setattr(inference.tables.contexts, "MOST", 5)
     engine = engine_of(Counting())
     for _ in range(2):
         assert torch.allclose(engine.filter(None, torch.arange(12.0) / 2)[-1].log_evidence, kept.log_evidence)

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from apmodels import Finite, Model, ValueOutOfRange, action, observation, state, static, where, zeros
 from apmodels.simulation import as_given
-from inference import Exact, Kalman, finite_record, passage
-from inference.record import Later, Record, alone
+from inference import Exact, Kalman
+from inference.records import finite_record, passage
+from inference.records.record import Later, Record, alone
 from tests import models
 from tests.inference.affine_models import affine_models
 from tests.inference.test_exact_random import models as finite_models
@@ -181,7 +182,7 @@ def test_hypotheses_known_states_and_actions(missing):
 
 
 def test_long_records_are_filtered_in_pieces(monkeypatch):
-    from inference import bank_record
+    from inference.records import bank_record
 
     monkeypatch.setattr(bank_record, "MOST", 2000)
     monkeypatch.setattr(finite_record, "MOST", 2000)
@@ -198,7 +199,7 @@ def test_long_records_are_filtered_in_pieces(monkeypatch):
 
 
 def test_what_is_wide_is_filtered_step_by_step(monkeypatch):
-    from inference import bank_record
+    from inference.records import bank_record
 
     monkeypatch.setattr(bank_record, "WIDEST", 1)
     engine = Kalman(models.Tracking())

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from apmodels import ValueOutOfRange
-from inference.gaussian import Gaussian, condition, move
+from inference.worlds.gaussian import Gaussian, condition, move
 
 
 def drawn(random, n, m):

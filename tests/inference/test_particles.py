@@ -16,7 +16,7 @@ from torch import Tensor
 
 from apmodels import Binary, Model, action, observation, state, static, where
 from inference import DepletionWarning, Particles
-from inference.record import Record
+from inference.records.record import Record
 from tests.inference.joint_gaussian import JointGaussian
 from tests.inference.oracle import Oracle
 from tests.inference.rates_quadrature import Quadrature, counted, interval, tossed

@@ -17,7 +17,7 @@ from scipy.special import gammaln
 
 from apmodels import Finite, Model, action, observation, state, static, where
 from inference import DepletionWarning, RaoBlackwell, Refusal
-from inference.record import Record
+from inference.records.record import Record
 from tests.models import Weather
 
 NAN = math.nan

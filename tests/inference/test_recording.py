@@ -5,8 +5,9 @@ import torch
 from pyro.distributions import Categorical, Normal
 
 from apmodels import Model, ValueOutOfRange, observation, state
-from inference import Particles, recording
-from inference.recording import Recorder, recorded
+from inference import Particles
+from inference.records import recording
+from inference.records.recording import Recorder, recorded
 
 
 def arithmetic(x, y):

@@ -1,0 +1,1 @@
+"""What is asked of a bank of worlds: marginals, entropies, forecasts, information."""

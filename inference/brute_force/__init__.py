@@ -1,0 +1,1 @@
+"""What beliefs must be, computed without any engine."""

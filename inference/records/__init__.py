@@ -1,0 +1,1 @@
+"""Whole records: what can be done for all steps at once."""

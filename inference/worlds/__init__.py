@@ -1,0 +1,1 @@
+"""A bank of worlds: what a world integrates, and how worlds move on."""

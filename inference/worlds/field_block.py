@@ -1,0 +1,138 @@
+"""An image of independent pixels that is only ever moved: two images, a mean and a variance.
+
+What a move does to means it does to variances; the way back, from what is seen to where it was, is the move's own
+derivative (thesis eqs 6.31 to 6.40).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from apmodels.distributions import base_of
+from apmodels.laws import Laws
+from inference.worlds.frame import Frame
+
+# Image by variable: the mean and the variance, (b, n, *shape).
+Images = dict[str, tuple[Tensor, Tensor]]
+
+
+class FieldBlock:
+    """The mean and variance of the image of a group; of a state, perhaps with a static that it begins as.
+
+    What a state began as is forgotten in the first step: from then on the two depend on each other.
+    """
+
+    def __init__(self, laws: Laws, names: tuple[str, ...], seen: list[str], roles: dict[str, str], remembered: Any):
+        self.laws, self.seen = laws, seen
+        self.statics = [name for name in names if roles[name] == "static"]
+        self.states = [name for name in names if roles[name] == "state"]
+        self.carried = [name for name in self.states if name in remembered]
+        self.group = set(names)
+
+    def start(self, frame: Frame, befores: dict[str, str | Tensor]) -> Images:
+        """Return the images before time began."""
+        images: Images = {}
+        for name in self.statics:
+            images[name] = self._moved(name, frame, images, {})
+        for name in self.carried:
+            before = befores[name]
+            if isinstance(before, str):
+                images[name] = images[before]
+            else:
+                before = before.to(self.laws.dtype)
+                images[name] = before, torch.zeros_like(before)
+        return images
+
+    def step(self, images: Images, frame: Frame, seen: dict[str, Tensor]) -> tuple[Images, Tensor]:
+        """Move the images on and condition on what is seen; return the images and the score, (b, n)."""
+        past = dict(images)
+        now = self._now(images)
+        for name in self.states:
+            now[name] = self._moved(name, frame, now, past)
+        total = torch.zeros(1, 1, dtype=self.laws.dtype)
+        for name in self.seen:
+            source = next(p.name for p in self.laws.variables[name].parents if p.name in self.group)
+            now[source], score = self._seen(name, source, frame, now[source], seen[name])
+            total = total + score
+        return now, total
+
+    def imagine(self, images: Images, frame: Frame, lead: tuple[int, int]) -> dict[str, Tensor]:
+        """Draw what would be seen after a step, (*lead, *shape) by name."""
+        now = self._now(images)
+        for name in self.states:
+            now[name] = self._moved(name, frame, now, images)
+        seen = {}
+        for name in self.seen:
+            centre, spread = self._predicted(name, frame, now)
+            seen[name] = centre + spread.sqrt() * torch.randn(*lead, *centre.shape[2:], dtype=centre.dtype)
+        return seen
+
+    def predicted(self, name: str, images: Images, frame: Frame) -> tuple[Tensor, Tensor]:
+        """Return the mean and the variance of what would be seen after a step."""
+        now = self._now(images)
+        for other in self.states:
+            now[other] = self._moved(other, frame, now, images)
+        return self._predicted(name, frame, now)
+
+    def _now(self, images: Images) -> Images:
+        """What of the last step is still there in this one."""
+        return {} if self.states else {name: images[name] for name in self.statics}
+
+    def _predicted(self, name: str, frame: Frame, now: Images) -> tuple[Tensor, Tensor]:
+        source = next(p.name for p in self.laws.variables[name].parents if p.name in self.group)
+        mean, variance = now[source]
+        centre, noise = self._law(name, frame, mean)
+        nothing, _ = self._law(name, frame, torch.zeros_like(mean))
+        spread, _ = self._law(name, frame, variance)
+        return centre, spread - nothing + noise
+
+    def _law(self, name: str, frame: Frame, image: Tensor | None) -> tuple[Tensor, Tensor]:
+        """A law's mean and variance where its parent in the group is ``image``, (b, n, *shape)."""
+        values = dict(frame.values)
+        for parent in self.laws.variables[name].parents:
+            if parent.name in self.group and image is not None:
+                values[parent.name, parent.lag] = image
+        here = Frame(values)
+        keys = [(p.name, p.lag) for p in self.laws.variables[name].parents]
+        law = here.in_all(self.laws, name, here.lead(keys))
+        if not isinstance(law, Distribution):
+            return law, torch.zeros_like(law)
+        base, _ = base_of(law)
+        return base.loc, base.scale**2
+
+    def _moved(self, name: str, frame: Frame, now: Images, past: Images) -> tuple[Tensor, Tensor]:
+        source = next((p for p in self.laws.variables[name].parents if p.name in self.group), None)
+        if source is None:
+            return self._law(name, frame, None)
+        mean, variance = (past if source.lag else now)[source.name]
+        centre, noise = self._law(name, frame, mean)
+        nothing, _ = self._law(name, frame, torch.zeros_like(mean))
+        spread, _ = self._law(name, frame, variance)
+        return centre, spread - nothing + noise
+
+    def _seen(
+        self, name: str, source: str, frame: Frame, image: tuple[Tensor, Tensor], value: Tensor
+    ) -> tuple[tuple[Tensor, Tensor], Tensor]:
+        mean, variance = image
+        centre, spread = self._predicted(name, frame, {source: image})
+        lead = torch.broadcast_shapes(centre.shape[:2], value.shape[:2])
+        missing = torch.isnan(value)
+        surprise = torch.where(missing, 0.0, value - centre)
+        weight = torch.where(missing, 0.0, 1 / spread)
+        wide = mean.expand(*lead, *mean.shape[2:]), variance.expand(*lead, *variance.shape[2:])
+        back = self._back(name, frame, wide[0])
+        after = wide[0] + wide[1] * back(surprise * weight)
+        shrunk = wide[1] - wide[1] ** 2 * back(weight.expand(*lead, *weight.shape[2:]))
+        score = -0.5 * (surprise**2 * weight + spread.log() + math.log(2 * math.pi))
+        score = torch.where(missing, 0.0, score).flatten(2).sum(-1)
+        return (after, shrunk.clamp(min=0)), score
+
+    def _back(self, name: str, frame: Frame, image: Tensor) -> Any:
+        """The way from what is seen to where it was: the transpose of the move."""
+        back: Any = torch.func.vjp(lambda x: self._law(name, frame, x)[0].expand(*image.shape[:2], -1, -1), image)[1]
+        return lambda value: back(value)[0]
