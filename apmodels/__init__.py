@@ -6,6 +6,7 @@ here too, one file each.
 
 from apmodels.acuity import Acuity as Acuity
 from apmodels.acuity import Calibrated as Calibrated
+from apmodels.contingency import Contingency as Contingency
 from apmodels.detector_search import CountModel as CountModel
 from apmodels.detector_search import DetectorSearch as DetectorSearch
 from apmodels.errors import DeclarationError as DeclarationError

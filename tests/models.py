@@ -1,7 +1,7 @@
 """Small models that several tests share; at the top of a module, so that they pickle."""
 
 import torch
-from pyro.distributions import Bernoulli, Beta, Categorical, Dirichlet, Gamma, Normal, Poisson
+from pyro.distributions import Bernoulli, Categorical, Dirichlet, Gamma, Normal, Poisson
 from torch import Tensor
 
 from apmodels import (
@@ -22,37 +22,6 @@ from apmodels import (
 )
 
 BLANK = zeros(4, 5)
-
-
-class Contingency(Model):
-    """Is anybody answering me?  (thesis ch. 4)"""
-
-    presence: float = 0.01
-    window: tuple[int, int] = (1, 3)
-
-    vocalize = action(Binary())
-
-    @static
-    def responsive(self):
-        return Bernoulli(self.presence)
-
-    @static
-    def rates(self):
-        """Sensor rates: my own echo, an answer, the background."""
-        return Beta(ones(3), ones(3)).to_event(1)
-
-    @state
-    def timer(self, vocalize, prev_timer=4):
-        """Steps since I called, 0 while I hear myself."""
-        return where(vocalize == 1, 0, (prev_timer + 1).clamp(max=self.window[1] + 1))
-
-    @observation
-    def sound(self, responsive, rates, timer):
-        first, last = self.window
-        answering = (first <= timer) & (timer <= last) & (responsive == 1)
-        return Bernoulli(rates[where(timer == 0, 0, where(answering, 1, 2))])
-
-    interest = responsive
 
 
 class RandomWalk(Model):

@@ -6,8 +6,20 @@ import torch
 from pyro.distributions import Bernoulli, Beta, Normal
 
 import apmodels
-from apmodels import Binary, DeclarationError, Grid, Model, ValueOutOfRange, action, observation, state, static, where
-from tests.models import Contingency, RandomWalk
+from apmodels import (
+    Binary,
+    Contingency,
+    DeclarationError,
+    Grid,
+    Model,
+    ValueOutOfRange,
+    action,
+    observation,
+    state,
+    static,
+    where,
+)
+from tests.models import RandomWalk
 
 
 class Coin(Model, abstract=True):
@@ -298,7 +310,7 @@ def test_overriding_may_change_role_and_parents():
 
     assert Wandering.declaration.variables["responsive"].role == "state"
     assert Wandering(window=(1, 2)).simulate(3, seed=0)["responsive"].shape == (3,)
-    refused("Bad.sound", "unknown parent echo", base=Contingency, sound=observation(lambda self, echo: None))
+    refused("Bad.sound", "unknown parent chatter", base=Contingency, sound=observation(lambda self, chatter: None))
 
 
 def test_super_calls_the_law_that_is_overridden():

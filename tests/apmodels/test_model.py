@@ -11,6 +11,7 @@ from scipy import stats
 
 from apmodels import (
     Calibrated,
+    Contingency,
     CountModel,
     DetectorSearch,
     Evidence,
@@ -25,7 +26,7 @@ from apmodels import (
     static,
 )
 from apmodels.simulation import seeded
-from tests.models import Contingency, LearningToLook, RandomWalk, Tracking, Weather
+from tests.models import LearningToLook, RandomWalk, Tracking, Weather
 
 SMALL = Grid(3, 4)
 COUNTS = CountModel(

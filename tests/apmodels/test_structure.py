@@ -23,6 +23,7 @@ from pyro.distributions import (
 from apmodels import (
     Binary,
     Box,
+    Contingency,
     Evidence,
     Finite,
     Grid,
@@ -39,7 +40,7 @@ from apmodels import (
     zeros,
 )
 from apmodels.supports import support_of
-from tests.models import Contingency, LearningToLook, RandomWalk, Tracking, Weather
+from tests.models import LearningToLook, RandomWalk, Tracking, Weather
 
 few = settings(deadline=None, max_examples=25)
 

@@ -8,13 +8,13 @@ import torch
 from scipy import stats
 
 import inference
-from apmodels import ValueOutOfRange
+from apmodels import Contingency, ValueOutOfRange
 from inference import Exact, Kalman, Refusal
 from inference.brute_force.reference import reference
 from inference.brute_force.weighed_worlds import drawn, gridded
 from inference.check import simulated
 from tests.inference.oracle import Oracle, plain
-from tests.models import Coin, Contingency, Coupled, RandomWalk, Tracking
+from tests.models import Coin, Coupled, RandomWalk, Tracking
 
 
 @pytest.mark.parametrize("model", [Coin(), RandomWalk(), Contingency(presence=0.3)], ids=lambda m: type(m).__name__)

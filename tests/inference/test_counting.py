@@ -9,12 +9,11 @@ import torch
 from pyro.distributions import Bernoulli, Beta, Categorical, Dirichlet, Gamma, Poisson
 from scipy import stats
 
-from apmodels import Binary, Box, Finite, Model, action, observation, state, static, where
+from apmodels import Binary, Box, Contingency, Finite, Model, action, observation, state, static, where
 from apmodels.simulation import as_given
 from inference import Exact
 from inference.records.record import Record
 from tests.inference.rates_quadrature import Quadrature, counted, grid, interval, rolled, tossed, triangle
-from tests.models import Contingency
 
 NAN = math.nan
 CLOSE = {"rtol": 1e-6, "atol": 1e-6}

@@ -7,9 +7,9 @@ import torch
 from pyro.distributions import Bernoulli, Categorical, Normal, Poisson
 from torch import Tensor, tensor, where
 
-from apmodels import Model, ValueOutOfRange, observation, state, static
+from apmodels import Contingency, Model, ValueOutOfRange, observation, state, static
 from inference import Kalman, Refusal, fit
-from tests.models import Contingency, LearningToLook, RandomWalk
+from tests.models import LearningToLook, RandomWalk
 
 
 class Chain(Model):

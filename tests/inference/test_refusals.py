@@ -9,9 +9,22 @@ from pyro.distributions import Bernoulli, Beta, Categorical, Dirichlet, Gamma, N
 from torch import Tensor
 
 import inference
-from apmodels import Box, Evidence, Finite, Model, ValueOutOfRange, action, observation, ones, state, static, where
+from apmodels import (
+    Box,
+    Contingency,
+    Evidence,
+    Finite,
+    Model,
+    ValueOutOfRange,
+    action,
+    observation,
+    ones,
+    state,
+    static,
+    where,
+)
 from inference import DepletionWarning, Exact, Kalman, Particles, RaoBlackwell, Refusal, Variational
-from tests.models import Coin, Contingency, Coupled, LearningToLook, RandomWalk, Tracking, Weather
+from tests.models import Coin, Coupled, LearningToLook, RandomWalk, Tracking, Weather
 
 NAN, INF = math.nan, math.inf
 ENGINES = [Exact, Kalman, RaoBlackwell, Particles, Variational]

@@ -7,10 +7,10 @@ import pytest
 import torch
 from pyro.infer import MCMC, NUTS, Predictive
 
-from apmodels import ValueOutOfRange
+from apmodels import Contingency, ValueOutOfRange
 from apmodels.simulation import as_given
 from inference import DepletionWarning, Exact, Kalman, Refusal, Variational
-from tests.models import Contingency, Coupled, Drift, LearningToLook, RandomWalk, Tracking, Twins
+from tests.models import Coupled, Drift, LearningToLook, RandomWalk, Tracking, Twins
 
 ACTIONS = torch.tensor([1, 0, 0, 0, 0, 0, 1, 0])
 SOUNDS = torch.tensor([1.0, 1.0, 0.0, 1.0, 0.0, math.nan, 1.0, 1.0])
