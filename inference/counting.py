@@ -10,6 +10,7 @@ from apmodels import Model
 from apmodels.structure import Structure
 from inference.engine import Bid
 from inference.exact import Exact
+from inference.worlds.count_process import CountProcess, count_process
 from inference.worlds.hypotheses import Hypotheses, hypotheses_plan
 from inference.worlds.plan import Plan
 from inference.worlds.statistic import Statistic, statistic
@@ -29,6 +30,10 @@ class Counting(Hypotheses):
     def statistic(self, belief: BankBelief) -> Statistic:
         """Return what the hypotheses' posterior depends on: known states, and the counts that bear on them."""
         return statistic(self, belief)
+
+    def process(self) -> CountProcess:
+        """Return the statistic as a Markov chain that actions steer: what plans are made on (thesis eq. 4.53)."""
+        return count_process(self)
 
     @classmethod
     def bid(cls, structure: Structure) -> Bid:

@@ -34,7 +34,7 @@ def statistic(engine: Any, belief: Any) -> Statistic:
     """Return the smallest set of counts from which all hypotheses' own follow, and that tell them apart."""
     parts, labels = [], []
     for i, block in enumerate(engine.tallies):
-        prior = block.start(Frame(_hypotheses(engine, belief)))
+        prior = block.start(Frame(hypotheses_of(engine, belief)))
         added = (belief.counts[i] - prior).expand(
             len(belief.log_weights), belief.log_weights.shape[1], *prior.shape[2:]
         )
@@ -49,7 +49,8 @@ def statistic(engine: Any, belief: Any) -> Statistic:
     return Statistic(known, counts[0] if single else counts, tuple(labels))
 
 
-def _hypotheses(engine: Any, belief: Any) -> dict:
+def hypotheses_of(engine: Any, belief: Any) -> dict:
+    """Return the hypotheses' values, as a frame wants them."""
     names = (*engine.plan.worlds, *engine.plan.computed)
     return {(name, 0): belief.values[name] for name in names if engine.roles[name] == "static"}
 
@@ -58,8 +59,7 @@ def _basis(engine: Any, belief: Any, index: int, prior: Tensor) -> list[tuple[in
     """The (hypothesis, component) pairs whose counts are enough, those with the fewest kinds of outcome first."""
     signatures = _signatures(engine, belief, index)
     worlds = signatures.shape[1]
-    bearing = _bearing(signatures, prior.expand(1, worlds, *prior.shape[2:])[0])
-    kinds = signatures[bearing]
+    kinds = signatures[bearing(signatures, prior.expand(1, worlds, *prior.shape[2:])[0])]
     pairs = sorted(
         {(h, int(c)) for row in kinds for h, c in enumerate(row.tolist()) if c >= 0}, key=lambda p: (-p[0], p[1])
     )
@@ -72,7 +72,7 @@ def _basis(engine: Any, belief: Any, index: int, prior: Tensor) -> list[tuple[in
     return sorted(chosen, key=lambda pair: (pair[1], pair[0]))
 
 
-def _bearing(signatures: Tensor, prior: Tensor) -> Tensor:
+def bearing(signatures: Tensor, prior: Tensor) -> Tensor:
     """Which signatures (K, hypotheses) hold a component that does not go the same way under all hypotheses."""
     uniform = (signatures == signatures[:, :1]).all(1)
     tells = torch.zeros(len(signatures), dtype=torch.bool)
@@ -89,7 +89,7 @@ def _signatures(engine: Any, belief: Any, index: int) -> Tensor:
     block = engine.tallies[index]
     found: set[tuple[int, ...]] = set()
     for context in _contexts(engine):
-        values = {key: value[:, None] for key, value in context.items()} | _hypotheses(engine, belief)
+        values = {key: value[:, None] for key, value in context.items()} | hypotheses_of(engine, belief)
         for child in block.selected:
             selected, _ = block.selected[child](Frame(values))
             wide = selected.expand(selected.shape[0], belief.log_weights.shape[1], -1)
@@ -99,7 +99,7 @@ def _signatures(engine: Any, belief: Any, index: int) -> Tensor:
 
 def _contexts(engine: Any) -> list[dict]:
     """Everything known by (name, lag), for every state of it that actions can lead to."""
-    actions = _choices(engine)
+    actions = actions_of(engine)
     outcomes = {name: engine.structure.nodes[name].values for name in engine.known.kept}
     waiting = [engine.known.first(1)]
     seen: set[tuple] = set()
@@ -121,7 +121,8 @@ def _contexts(engine: Any) -> list[dict]:
     return found
 
 
-def _choices(engine: Any) -> list[Values]:
+def actions_of(engine: Any) -> list[Values]:
+    """Return every action, (1, *shape) by name; ValueOutOfRange where they have no list."""
     values = {name: space.values() for name, space in engine.spaces.items() if space.size}
     if len(values) < len(engine.spaces):
         raise ValueOutOfRange(
