@@ -7,7 +7,8 @@ import torch
 from apmodels import DetectorSearch, Grid, VisualSearch
 from benchmarks.timing import milliseconds
 from controllers import GreedyInfomax, MostProbable
-from inference import Exact, tables
+from inference import Exact
+from inference.tables import families
 
 SIDES = (7, 11, 21, 31, 51)
 
@@ -23,12 +24,12 @@ def measure() -> dict[str, float]:
 
 def _dense(model) -> Exact:
     """The same engine, made to score every element under every hypothesis."""
-    share, tables.SPARSE = tables.SPARSE, -1.0
+    share, families.SPARSE = families.SPARSE, -1.0
     try:
         engine = Exact(model)
         engine.update(engine.start(), 0, torch.zeros(model.grid.size))
     finally:
-        tables.SPARSE = share
+        families.SPARSE = share
     return engine
 
 
