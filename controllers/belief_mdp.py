@@ -58,27 +58,23 @@ class BeliefMDP:
         return lattice(self.after, self.atom, self.first, self.process.atoms, steps, self.mirrored)
 
     def tables(self, states: Lattice) -> tuple[Array, Array]:
-        """Return every state's reward, (N,), and the chance of a one of every atom, (K, N)."""
+        """Return every state's reward, (N,), and the share of every hypothesis but the first, (H - 1, N)."""
         # Importing a compiler takes long; who does not plan does not wait for it.
         from controllers.sweeps import informed
 
-        reward, chance = np.empty(states.size), np.empty((self.process.atoms, states.size))
-        groups, process = self.groups(), self.process
-        most = int(states.totals.sum(1).max()) + 1
+        process = self.process
+        reward, shares = np.empty(states.size), np.empty((len(process.log_prior) - 1, states.size))
+        groups, most = self.groups(), int(states.totals.sum(1).max()) + 1
         prior = process.prior.numpy()
-        pseudo = prior[..., None] + np.arange(most)
-        normal = gammaln(pseudo) - gammaln(prior)[..., None]
         total = prior.sum(-1)
+        normal = gammaln(prior[..., None] + np.arange(most)) - gammaln(prior)[..., None]
         whole = gammaln(total[..., None] + np.arange(most)) - gammaln(total)[..., None]
         which = np.zeros(len(process.log_prior), dtype=np.int64) if groups is None else groups.numpy()
-        packed = states.totals, states.offset, states.earliest, states.after, states.mirrored
-        component = process.component.numpy()
-        informed(
-            reward, chance, states.rows, packed, process.log_prior.numpy(), which, component, pseudo, normal, whole
-        )
+        component, logs = process.component.numpy(), process.log_prior.numpy()
+        informed(reward, shares, states.rows, states.packed, logs, which, component, normal, whole)
         if groups is None:
             self._asked(reward, states)
-        return reward, chance
+        return reward, shares
 
     def seconds(self, states: int) -> float:
         """Return about how long it takes to ask for so many states' rewards; 0 where they are in closed form."""

@@ -83,7 +83,7 @@ class DynamicProgramming(Controller):
         """Seconds a value takes on this machine, by a short plan; compiling is not counted."""
         horizon = min(SAMPLE, self.horizon) if self.mdp.process.atoms < 3 else 2
         states = self.mdp.lattice(horizon)
-        blank = np.zeros(states.size), np.zeros((self.mdp.process.atoms, states.size))
+        blank = np.zeros(states.size), np.zeros((len(self.mdp.process.log_prior) - 1, states.size))
         _, visits = size(self.mdp, states, horizon, 0, horizon)
         weights = SHARES["summed"](horizon)
         solve(self.mdp, horizon, weights, states=states, tables=blank)

@@ -36,6 +36,11 @@ class Lattice:
     layers: Array
     mirrored: bool
 
+    @property
+    def packed(self) -> tuple:
+        """What a compiled sweep is told."""
+        return self.totals, self.offset, self.earliest, self.after, self.mirrored
+
     def index(self, counts: Array) -> Array:
         """Return where states are; ``counts`` are (n, K, 2)."""
         totals, ones = counts.sum(-1), counts[..., 1]

@@ -59,20 +59,20 @@ def solve(
         keep: which steps that are left are kept.
         advance: called after every sweep.
         states: all counts that can be reached in as many steps, where they have been laid out already.
-        tables: their rewards and chances, where these are known already.
+        tables: their rewards, and the hypotheses' shares, where these are known already.
     """
     from controllers.sweeps import sweep
 
-    states = states or mdp.lattice(horizon + steps)
     begin = time.perf_counter()
-    reward, chance = mdp.tables(states) if tables is None else tables
+    states = states or mdp.lattice(horizon + steps)
+    reward, shares = mdp.tables(states) if tables is None else tables
     kinds, actions = mdp.after.shape
     pairs = np.stack([mdp.after, mdp.atom], -1).reshape(-1, 2)
     moves, choices = np.unique(pairs, axis=0, return_inverse=True)
     values = np.empty((kinds, states.size))
     np.multiply(reward, weights[-1], out=values[0])
     values[1:] = values[0]
-    packed = states.totals, states.offset, states.earliest, states.after, states.mirrored
+    counted = mdp.process.component.numpy(), mdp.process.prior.numpy()
     options = choices.reshape(kinds, actions)
     way = np.ascontiguousarray(moves[:, 0]), np.ascontiguousarray(moves[:, 1])
     layers: dict[int, Array] = {}
@@ -80,7 +80,20 @@ def solve(
         bound = horizon + steps - left
         weight = weights[horizon - left - 1] if left < horizon else 0.0
         decided = np.zeros((kinds, states.size if keep(left) else 0), dtype=np.uint8)
-        sweep(values, reward, chance, weight, states.rows, states.layers, bound, packed, way, options, decided)
+        sweep(
+            values,
+            reward,
+            shares,
+            weight,
+            states.rows,
+            states.layers,
+            bound,
+            states.packed,
+            counted,
+            way,
+            options,
+            decided,
+        )
         if keep(left):
             reached = int(states.offset[states.earliest <= bound].max()) + int(_largest(states, bound))
             layers[left] = np.packbits(decided[:, :reached], axis=1) if actions == 2 else decided[:, :reached].copy()
@@ -98,7 +111,7 @@ def size(mdp: BeliefMDP, states: Lattice, horizon: int, steps: int, kept: int) -
     ends = np.searchsorted(states.earliest[order], np.arange(horizon + steps + 1), side="right")
     visits = below[ends[steps : horizon + steps]].sum() * kinds
     bits = kinds * states.size * (1 / 8 if actions == 2 else 1)
-    working = states.size * (8.0 * (kinds + 1 + mdp.process.atoms) + (kinds if kept else 0))
+    working = states.size * (8.0 * (kinds + len(mdp.process.log_prior)) + (kinds if kept else 0))
     return working + kept * bits, float(visits)
 
 

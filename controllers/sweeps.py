@@ -45,9 +45,38 @@ def _start(totals, ones, offset, atom, added, mirrored):
     return start, step
 
 
+@njit(cache=True)
+def _expected(k, totals, ones, h, component, prior):
+    """The mean chance of a one of an atom under a hypothesis, as a + b * (ones of the last atom)."""
+    c, last = component[k, h], len(totals) - 1
+    one, seen = prior[h, c, 1], prior[h, c, 0] + prior[h, c, 1]
+    for other in range(last + 1):
+        if component[other, h] == c:
+            seen += totals[other]
+            if other < last:
+                one += ones[other]
+    return one / seen, (1.0 / seen if component[last, h] == c else 0.0)
+
+
+@njit(cache=True)
+def _chances(chance, shares, base, totals, ones, component, prior):
+    """Fill the chance of a one of every atom, along a row."""
+    for k in range(len(totals)):
+        row = chance[k]
+        a, b = _expected(k, totals, ones, 0, component, prior)
+        for i in range(len(row)):
+            row[i] = a + b * i
+        for h in range(1, component.shape[1]):
+            c, d = _expected(k, totals, ones, h, component, prior)
+            c, d, share = c - a, d - b, shares[h - 1, base : base + len(row)]
+            for i in range(len(row)):
+                row[i] += share[i] * (c + d * i)
+
+
 @njit(parallel=True, cache=True)
-def _layer(values, reward, chance, weight, rows, bound, lattice, moves, choices, decided):
+def _layer(values, reward, shares, weight, rows, bound, lattice, counted, moves, choices, decided):
     totals, offset, earliest, after, mirrored = lattice
+    component, prior = counted
     to, atom = moves
     atoms = totals.shape[1]
     for r in prange(len(rows)):
@@ -58,7 +87,8 @@ def _layer(values, reward, chance, weight, rows, bound, lattice, moves, choices,
         _decoded(totals[block], rows[r, 1], mirrored, ones)
         size = totals[block, atoms - 1] + 1
         base, _ = _start(totals[block], ones, offset[block], -1, 0, mirrored)
-        ahead = np.empty((len(to), size))
+        chance, ahead = np.empty((atoms, size)), np.empty((len(to), size))
+        _chances(chance, shares, base, totals[block], ones, component, prior)
         for j in range(len(to)):
             there, k = values[to[j]], atom[j]
             if k < 0:
@@ -71,8 +101,7 @@ def _layer(values, reward, chance, weight, rows, bound, lattice, moves, choices,
             target = offset[after[block, k]]
             zero, _ = _start(totals[block], ones, target, k, 0, mirrored)
             one, step = _start(totals[block], ones, target, k, 1, mirrored)
-            p = chance[k, base : base + size]
-            row, a = ahead[j], there[zero : zero + size]
+            p, row, a = chance[k], ahead[j], there[zero : zero + size]
             if step == 1:
                 b = there[one : one + size]
                 for i in range(size):
@@ -98,28 +127,28 @@ def _layer(values, reward, chance, weight, rows, bound, lattice, moves, choices,
 
 
 @njit(cache=True)
-def sweep(values, reward, chance, weight, rows, layers, bound, lattice, moves, choices, decided):
+def sweep(values, reward, shares, weight, rows, layers, bound, lattice, counted, moves, choices, decided):
     """Replace values (C, N) by those of a step more, of blocks that can be reached in ``bound`` steps.
 
-    ``reward`` (N,) counts ``weight`` times; ``chance`` (K, N) is that of a one; ``moves`` are (state, atom) that an
-    action may lead to, ``choices`` (C, U) which move an action is; ``decided`` (C, N) takes the best actions, or is
-    (C, 0).
+    ``reward`` (N,) counts ``weight`` times; ``shares`` (H - 1, N) are all hypotheses' but the first one's; ``moves``
+    are (state, atom) that an action may lead to, ``choices`` (C, U) which move an action is; ``decided`` (C, N) takes
+    the best actions, or is (C, 0).
     """
     for layer in range(min(bound, len(layers) - 2) + 1):
         part = rows[layers[layer] : layers[layer + 1]]
-        _layer(values, reward, chance, weight, part, bound, lattice, moves, choices, decided)
+        _layer(values, reward, shares, weight, part, bound, lattice, counted, moves, choices, decided)
 
 
 @njit(parallel=True, cache=True)
-def informed(reward, chance, rows, lattice, log_prior, groups, component, counted, normal, whole):
-    """Fill rewards (N,), minus the entropy of the interest in nats, and chances of a one (K, N), state by state.
+def informed(reward, shares, rows, lattice, log_prior, groups, component, normal, whole):
+    """Fill rewards (N,), minus the entropy of the interest in nats, and shares of all hypotheses but the first.
 
-    ``counted`` (H, C, 2, T) are prior pseudo-counts and what was counted, ``normal`` the log gamma of those and
-    ``whole`` (H, C, T) of their sums; ``groups`` (H,) say which value of the interest a hypothesis has.
+    ``normal`` (H, C, 2, T) are the log gamma of pseudo-counts after so many outcomes, ``whole`` (H, C, T) of their
+    sums, over those of the prior; ``groups`` (H,) say which value of the interest a hypothesis has.
     """
     totals, offset, _, _, mirrored = lattice
     atoms, hypotheses = component.shape
-    kinds = counted.shape[1]
+    kinds = normal.shape[1]
     for r in prange(len(rows)):
         block = rows[r, 0]
         n = totals[block]
@@ -156,10 +185,5 @@ def informed(reward, chance, rows, lattice, log_prior, groups, component, counte
                 if share[h] > 0:
                     found += share[h] * math.log(share[h])
             reward[base + i] = found
-            for k in range(atoms):
-                mean = 0.0
-                for h in range(hypotheses):
-                    c = component[k, h]
-                    one = counted[h, c, 1, yes[h, c]]
-                    mean += logs[h] * one / (one + counted[h, c, 0, seen[h, c] - yes[h, c]])
-                chance[k, base + i] = mean
+            for h in range(1, hypotheses):
+                shares[h - 1, base + i] = logs[h]
