@@ -9,6 +9,9 @@ import torch
 from controllers.controller import Controller
 from inference import Belief, Engine, Refusal
 
+# How many units of rounding may lie between equals.
+ROUNDING = 64
+
 
 class GreedyInfomax(Controller):
     """Chooses the action with the largest expected information about the interest (thesis eq. 5.4).
@@ -32,7 +35,9 @@ class GreedyInfomax(Controller):
         self.samples = samples
 
     def act(self, belief: Belief) -> Any:
-        """Return the most informative candidate, for each belief; the first of equals."""
+        """Return the most informative candidate, for each belief; of those equal but for rounding, the first."""
         seed = int(torch.randint(2**31, (), generator=self.generator))
         gain = self.engine.gain(belief, self.candidates, samples=self.samples, seed=seed)
-        return self.candidates[gain.argmax(-1)]
+        best = gain.amax(-1, keepdim=True)
+        equal = gain >= best - ROUNDING * torch.finfo(gain.dtype).eps * best.abs().clamp(min=1.0)
+        return self.candidates[equal.to(torch.uint8).argmax(-1)]

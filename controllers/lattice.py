@@ -71,22 +71,40 @@ def reached(after: Array, atom: Array, first: int, atoms: int, steps: int) -> Ar
     """Return the first step in which totals (steps + 1, ...) can be reached, a large number where they cannot be."""
     never = np.iinfo(np.int32).max
     earliest = np.full((len(after), *(steps + 1,) * atoms), never, dtype=np.int32)
-    edge = np.zeros(earliest.shape, dtype=bool)
-    edge[first].flat[0] = True
-    earliest[first].flat[0] = 0
+    edge = _begun(earliest.shape, first)
+    earliest[edge] = 0
     for t in range(1, steps + 1):
-        ahead = np.zeros_like(edge)
-        for state in range(len(after)):
-            for to, k in zip(after[state], atom[state], strict=True):
-                here, there = [slice(None)] * atoms, [slice(None)] * atoms
-                if k >= 0:
-                    here[k], there[k] = slice(None, -1), slice(1, None)
-                ahead[to][tuple(there)] |= edge[state][tuple(here)]
-        edge = ahead & (earliest == never)
+        edge = _ahead(edge, after, atom) & (earliest == never)
         earliest[edge] = t
         if not edge.any():
             break
     return earliest.min(0)
+
+
+def visited(after: Array, atom: Array, first: int, atoms: int, steps: int) -> Array:
+    """Tell which states and totals (states, steps + 1, ...) can be met after exactly so many steps."""
+    edge = _begun((len(after), *(steps + 1,) * atoms), first)
+    for _ in range(steps):
+        edge = _ahead(edge, after, atom)
+    return edge
+
+
+def _begun(shape: tuple[int, ...], first: int) -> Array:
+    edge = np.zeros(shape, dtype=bool)
+    edge[first].flat[0] = True
+    return edge
+
+
+def _ahead(edge: Array, after: Array, atom: Array) -> Array:
+    """Where all actions and outcomes lead."""
+    ahead, atoms = np.zeros_like(edge), edge.ndim - 1
+    for state in range(len(after)):
+        for to, k in zip(after[state], atom[state], strict=True):
+            here, there = [slice(None)] * atoms, [slice(None)] * atoms
+            if k >= 0:
+                here[k], there[k] = slice(None, -1), slice(1, None)
+            ahead[to][tuple(there)] |= edge[state][tuple(here)]
+    return ahead
 
 
 def lattice(after: Array, atom: Array, first: int, atoms: int, steps: int, mirrored: bool) -> Lattice:
