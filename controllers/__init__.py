@@ -8,5 +8,7 @@ from controllers.greedy_infomax import GreedyInfomax as GreedyInfomax
 from controllers.most_probable import MostProbable as MostProbable
 from controllers.playback import Playback as Playback
 from controllers.random import Random as Random
+from controllers.receding_horizon import RecedingHorizon as RecedingHorizon
 from controllers.rewards import Information as Information
 from controllers.rollout import rollout as rollout
+from controllers.temporal_difference import TemporalDifference as TemporalDifference

@@ -53,9 +53,11 @@ class BeliefMDP:
         """Return which value of the interest each hypothesis has, where rewards are information about those."""
         return self.reward.groups(self.process) if isinstance(self.reward, Information) else None
 
-    def lattice(self, steps: int) -> Lattice:
-        """Return all counts that can be reached in some steps."""
-        return lattice(self.after, self.atom, self.first, self.process.atoms, steps, self.mirrored)
+    def lattice(self, steps: int, mirrored: bool | None = None, first: Any = None) -> Lattice:
+        """Return all counts that can be reached in some steps, from a kind of known state or some of them."""
+        first = self.first if first is None else first
+        mirrored = self.mirrored if mirrored is None else mirrored
+        return lattice(self.after, self.atom, first, self.process.atoms, steps, mirrored)
 
     def tables(self, states: Lattice) -> tuple[Array, Array]:
         """Return every state's reward, (N,), and the share of every hypothesis but the first, (H - 1, N)."""

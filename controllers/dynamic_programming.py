@@ -56,7 +56,7 @@ class DynamicProgramming(Controller):
         if horizon < 1 or (steps is not None and steps < 1):
             raise ValueOutOfRange(f"a plan needs a horizon and steps of 1 or more, not {horizon} and {steps}")
         self.mdp, self.horizon, self.steps = BeliefMDP(engine, reward), horizon, steps
-        self.weights = _weights(weights, horizon)
+        self.weights = shares(weights, horizon)
         self.plan = self._solved(memory)
 
     def _solved(self, memory: float | None) -> Plan:
@@ -95,7 +95,11 @@ class DynamicProgramming(Controller):
         if belief.time >= last:
             raise ValueOutOfRange(f"the plan is for {last} steps, and {belief.time} have passed; give steps=, or more")
         left = self.horizon - belief.time if self.steps is None else self.horizon
-        chosen = torch.as_tensor(self.plan.choose(*self.mdp.read(belief), left).astype(np.int64))
+        return self.chosen(belief, *self.mdp.read(belief), left)
+
+    def chosen(self, belief: Belief, kind: np.ndarray, counts: np.ndarray, left: int) -> Any:
+        """Return the plan's action for kinds of known states and counts, shaped as a belief's actions are."""
+        chosen = torch.as_tensor(self.plan.choose(kind, counts, left).astype(np.int64))
         if belief.batch is None:
             chosen = chosen[0]
         picked = {name: values[chosen] for name, values in self.mdp.process.actions.items()}
@@ -123,7 +127,8 @@ class DynamicProgramming(Controller):
         return made
 
 
-def _weights(weights: str | Sequence[float], horizon: int) -> list[float]:
+def shares(weights: str | Sequence[float], horizon: int) -> list[float]:
+    """Return how much the reward after each step counts."""
     if isinstance(weights, str):
         if weights not in SHARES:
             raise ValueOutOfRange(f"there are no {weights} rewards; there are {', '.join(SHARES)}, or give numbers")

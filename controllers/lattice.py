@@ -41,6 +41,12 @@ class Lattice:
         """What a compiled sweep is told."""
         return self.totals, self.offset, self.earliest, self.after, self.mirrored
 
+    def has(self, counts: Array) -> Array:
+        """Tell which counts (n, K, 2) are among the states."""
+        totals = counts.sum(-1)
+        inside = (totals < len(self.number)).all(1)
+        return inside & (self.number[tuple(np.where(inside[:, None], totals, 0).T)] >= 0)
+
     def index(self, counts: Array) -> Array:
         """Return where states are; ``counts`` are (n, K, 2)."""
         totals, ones = counts.sum(-1), counts[..., 1]
@@ -67,7 +73,7 @@ class Lattice:
         return np.stack([totals - ones, ones], -1)
 
 
-def reached(after: Array, atom: Array, first: int, atoms: int, steps: int) -> Array:
+def reached(after: Array, atom: Array, first: Any, atoms: int, steps: int) -> Array:
     """Return the first step in which totals (steps + 1, ...) can be reached, a large number where they cannot be."""
     never = np.iinfo(np.int32).max
     earliest = np.full((len(after), *(steps + 1,) * atoms), never, dtype=np.int32)
@@ -81,7 +87,7 @@ def reached(after: Array, atom: Array, first: int, atoms: int, steps: int) -> Ar
     return earliest.min(0)
 
 
-def visited(after: Array, atom: Array, first: int, atoms: int, steps: int) -> Array:
+def visited(after: Array, atom: Array, first: Any, atoms: int, steps: int) -> Array:
     """Tell which states and totals (states, steps + 1, ...) can be met after exactly so many steps."""
     edge = _begun((len(after), *(steps + 1,) * atoms), first)
     for _ in range(steps):
@@ -89,9 +95,9 @@ def visited(after: Array, atom: Array, first: int, atoms: int, steps: int) -> Ar
     return edge
 
 
-def _begun(shape: tuple[int, ...], first: int) -> Array:
+def _begun(shape: tuple[int, ...], first: Any) -> Array:
     edge = np.zeros(shape, dtype=bool)
-    edge[first].flat[0] = True
+    edge[(first, *[0] * (len(shape) - 1))] = True
     return edge
 
 
@@ -107,7 +113,7 @@ def _ahead(edge: Array, after: Array, atom: Array) -> Array:
     return ahead
 
 
-def lattice(after: Array, atom: Array, first: int, atoms: int, steps: int, mirrored: bool) -> Lattice:
+def lattice(after: Array, atom: Array, first: Any, atoms: int, steps: int, mirrored: bool) -> Lattice:
     """Lay out all counts that can be reached in some steps; ``after`` and ``atom`` are (states, actions)."""
     mirrored = mirrored and atoms > 1
     dense = reached(after, atom, first, atoms, steps)

@@ -66,3 +66,13 @@ def test_baby_9_finds_out(tmp_path):
 def test_what_makes_no_sense_is_one_sentence(tmp_path, words, says):
     code, _, complaint = apmodels(tmp_path, *words)
     assert code == 2 and one_sentence(complaint) and says in complaint
+
+
+def test_it_can_be_learned(tmp_path):
+    words = ("quick=true", "horizons=[6,8]", "calls=20000")
+    found, data, said = run(tmp_path, "learning", *words)
+    assert found["td6.calls"] < found["td8.calls"] < found["td12.calls"]
+    assert found["td12.calls"] < found["optimism_1.td12.calls"]
+    assert 0.5 < found["receding.fraction"] < 1.5 and found["receding.fraction.se"] > 0
+    assert 0.9 < found["receding.reward_fraction"] < 1.1
+    assert data.calls.sizes == {"optimism": 2, "horizon": 3, "run": 1} and "are learned in" in said.replace("\n", " ")
