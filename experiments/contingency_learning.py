@@ -158,6 +158,7 @@ def _draw(found: xr.Dataset, curves: dict[float, list[tuple[int, float]]], confi
     shares.axvline(config.calls, color="grey", ls=":")
     shares.axhline(config.share, color="grey", ls=":")
     shares.set(xlabel="calls since birth", ylabel="share of the best 12-step policy", xlim=(0, 1.5 * config.calls))
+    shares.xaxis.set_major_formatter(lambda calls, _: f"{calls / 1000:.0f}k")
     shares.legend()
     for optimism in found.optimism.values.tolist():
         mean = found.calls.sel(optimism=optimism).mean("run")
