@@ -62,7 +62,7 @@ def usage() -> str:
         "",
     ]
     lines += ["experiments"]
-    lines += [f"  {name:<22} {about}" for name, about in choices("experiment").items()]
+    lines += [f"  {name:<31} {about}" for name, about in choices("experiment").items()]
     lines += ["", "tools (apmodels NAME --help)"]
     lines += [f"  {name:<22} {about}" for name, (_, about) in TOOLS.items()]
     lines += ["", "groups (GROUP=NAME)"]
