@@ -56,7 +56,7 @@ class DynamicProgramming(Controller):
         if horizon < 1 or (steps is not None and steps < 1):
             raise ValueOutOfRange(f"a plan needs a horizon and steps of 1 or more, not {horizon} and {steps}")
         self.mdp, self.horizon, self.steps = BeliefMDP(engine, reward), horizon, steps
-        self.weights = shares(weights, horizon)
+        self.weights, self.starts = shares(weights, horizon), np.array([self.mdp.first])
         self.plan = self._solved(memory)
 
     def _solved(self, memory: float | None) -> Plan:
@@ -109,20 +109,22 @@ class DynamicProgramming(Controller):
         """Keep the policy, packed and compressed."""
         layers = {f"left_{left}": layer for left, layer in self.plan.layers.items()}
         about = {"horizon": self.horizon, "steps": self.steps or 0, "value": self.plan.value, "model": repr(self.model)}
+        about |= {"mirrored": self.plan.states.mirrored, "starts": self.starts}
         np.savez_compressed(path, **layers, **about)  # type: ignore[arg-type]
 
     @classmethod
     def load(cls, engine: Engine, path: str | Path, reward: Callable[[Any], Any] | None = None) -> DynamicProgramming:
-        """Return the controller that was saved, for an engine of the same model."""
+        """Return a controller that does what the saved one did, planned or learned, for an engine of the same model."""
         with np.load(path, allow_pickle=False) as kept:
             if str(kept["model"]) != repr(engine.model):
                 raise ValueOutOfRange(f"{path} is a plan for {kept['model']}, and not for {engine.model!r}")
-            made = cls.__new__(cls)
+            made = DynamicProgramming.__new__(DynamicProgramming)
             Controller.__init__(made, engine)
             made.mdp, made.horizon = BeliefMDP(engine, reward), int(kept["horizon"])
             made.steps = int(kept["steps"]) or None
             layers = {int(name[5:]): kept[name] for name in kept.files if name.startswith("left_")}
-            states = made.mdp.lattice(made.horizon + (made.steps - 1 if made.steps else 0))
+            extra, made.starts = made.steps - 1 if made.steps else 0, kept["starts"]
+            states = made.mdp.lattice(made.horizon + extra, bool(kept["mirrored"]), made.starts)
             made.plan = Plan(states, made.horizon, made.mdp.after.shape[1], float(kept["value"]), layers, 0.0)
         return made
 

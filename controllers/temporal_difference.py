@@ -53,6 +53,7 @@ class TemporalDifference(DynamicProgramming):
         self.mdp, self.horizon, self.steps = BeliefMDP(engine, reward), horizon, None
         self.weights, self.epsilon, self.seed, self.learned = shares(weights, horizon), epsilon, seed, 0
         self.table = Table(self.mdp, horizon, anywhere)
+        self.starts = self.table.starts
         still = np.cumsum(np.array([0.0, *self.weights])[::-1])[::-1, None] * self.table.reward
         self.values = np.repeat((1 - optimism) * still[:, None], len(self.mdp.after), 1)
         self._policy: Plan | None = None

@@ -48,6 +48,17 @@ def test_the_same_seed_learns_the_same(engine):
     assert not np.array_equal(other.values, found[0])
 
 
+@pytest.mark.parametrize("anywhere", [False, True])
+def test_what_was_learned_is_kept_and_opened_again(engine, anywhere, tmp_path):
+    learner = TemporalDifference(engine, 6, anywhere=anywhere)
+    learner.learn(3000)
+    learner.save(tmp_path / "learned.npz")
+    again = DynamicProgramming.load(engine, tmp_path / "learned.npz")
+    one, other = (rollout(Simulated(engine.model, batch=200), engine, c, steps=6, seed=4) for c in (learner, again))
+    assert (one.vocalize == other.vocalize).all() and one.vocalize.values.any()
+    assert again.plan.value == learner.plan.value
+
+
 def test_a_memory_as_long_as_the_episode_is_the_plan_itself(engine):
     learner = TemporalDifference(engine, 8, anywhere=True)
     learner.learn(3000)
