@@ -50,8 +50,11 @@ class RecedingHorizon(Controller):
             self.steps.append(counts - self.last)
         self.last, self.time = counts, belief.time
         seen = sum(self.steps, np.zeros_like(counts))
-        left = max(self.lookahead, self.maker.horizon - belief.time)
-        return self.maker.chosen(belief, kind, np.asarray(seen), left)
+        return self.maker.chosen(belief, kind, np.asarray(seen), self.left(len(self.steps)))
+
+    def left(self, seen: int) -> int:
+        """Return how many steps the plan is asked to look ahead; further, while less than all of memory was seen."""
+        return self.lookahead + self.memory - seen
 
     def __repr__(self) -> str:
         return f"RecedingHorizon({self.maker!r}, memory={self.memory}, lookahead={self.lookahead})"

@@ -5,18 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import torch
 import xarray as xr
 from hydra.utils import instantiate
 from rich.console import Console
-from rich.progress import track
 
 from apmodels import ValueOutOfRange
-from controllers import DynamicProgramming, RecedingHorizon, TemporalDifference, rollout
+from apmodels.progress import tracked
+from controllers import TemporalDifference
+from experiments.contingency_accuracy import identify
+from experiments.contingency_learning_figure import draw
+from experiments.contingency_receding import recede
 from experiments.study import Result
-from hardware import Simulated
 from inference import Exact
 
 # The thesis's calls to convergence, by steps of a trial.
@@ -29,38 +30,43 @@ QUICK = 10
 def learning(config: Any, folder: Path, console: Console) -> Result:
     """Learn, and compare what was learned with the best; see ``conf/experiment/contingency/learning.yaml``."""
     engine = Exact(instantiate(config.model), torch.float64)
-    runs, episodes = (1, 1000) if config.quick else (config.runs, config.episodes)
+    _check(config)
+    runs = 1 if config.quick else config.runs
     chosen = sorted({12, *(h for h in config.horizons if not config.quick or h <= QUICK)})
-    if min(chosen) < 2 or runs < 1 or episodes < 1 or not 0 < config.share < 1:
-        raise ValueOutOfRange("learning needs horizons of 2 steps or more, 1 run, 1 episode, and a share in (0, 1)")
     calls = np.full((len(config.optimism), len(chosen), runs), np.nan)
     jobs = [(i, j, r) for i in range(len(config.optimism)) for j in range(len(chosen)) for r in range(runs)]
     curves: dict[float, list[tuple[int, float]]] = {}
     within = np.zeros((len(config.optimism), runs))
-    for i, j, r in track(jobs, "learning", transient=True):
+    for i, j, r in tracked(jobs, "learning"):
         curve = _learned(engine, chosen[j] - 1, config, config.optimism[i], config.seed + r)
         calls[i, j, r] = next(done for done, share in curve if share >= config.share)
         if chosen[j] == 12:
             curves.setdefault(config.optimism[i], curve)
             within[i, r] = _within(curve, config.calls)
-    summary = _summary(config, chosen, calls, within)
-    fractions, data = _receding(engine, config, episodes)
-    summary |= fractions
+    learner, receding, data = recede(engine, config, runs)
+    identified, more = identify(learner, config)
+    summary = _summary(config, chosen, calls, within) | receding | identified
     _tell(console, config, summary)
     found = xr.Dataset(
-        {"calls": (("optimism", "horizon", "run"), calls), **data},
-        coords={"optimism": list(config.optimism), "horizon": chosen},
+        {"calls": (("optimism", "horizon", "run"), calls)} | data | more,
+        coords={"optimism": list(config.optimism), "horizon": chosen, "memory": list(config.memory)},
     )
-    return Result(summary, {"learning": found}, {"learning": _draw(found, curves, config)})
+    return Result(summary, {"learning": found}, {"learning": draw(found, curves, config, THESIS)})
 
 
-def _learner(engine: Any, actions: int, config: Any, optimism: float, seed: int) -> TemporalDifference:
-    return TemporalDifference(engine, actions, epsilon=config.epsilon, optimism=optimism, anywhere=True, seed=seed)
+def _check(config: Any) -> None:
+    many = min(config.runs, config.steps, config.looks, config.calls, config.accuracy.steps, *config.memory)
+    shares = config.share, config.accuracy.share, config.accuracy.presence
+    if not config.memory or min(config.horizons) < 2 or many < 1 or not all(0 < share < 1 for share in shares):
+        raise ValueOutOfRange(
+            "learning needs horizons of 2 steps or more; 1 run, look, call, step and step remembered, or more; and "
+            "shares in (0, 1)"
+        )
 
 
 def _learned(engine: Any, actions: int, config: Any, optimism: float, seed: int) -> list[tuple[int, float]]:
     """(Calls so far, share of the best policy's information), until enough is learned and enough calls were made."""
-    learner = _learner(engine, actions, config, optimism, seed)
+    learner = TemporalDifference(engine, actions, epsilon=config.epsilon, optimism=optimism, anywhere=True, seed=seed)
     nothing = -float(engine.start().entropy()) * actions
     best = learner.table.best(learner.weights) - nothing
     done, curve = 0, [(0, (learner.plan.value - nothing) / best)]
@@ -92,48 +98,6 @@ def _summary(config: Any, chosen: list[int], calls: np.ndarray, within: np.ndarr
     return summary
 
 
-def _receding(engine: Any, config: Any, episodes: int) -> tuple[dict[str, float], dict[str, Any]]:
-    """What a learned plan with a short memory finds out, as a share of the best plan's information.
-
-    Episodes are drawn apart for whether somebody answers and weighed by the prior, which makes both certain to occur.
-    """
-    learner = _learner(engine, config.memory + config.lookahead, config, config.optimism[-1], config.seed)
-    done = 0
-    while done < config.calls:
-        done += int(learner.learn(100)[1])
-    made = {
-        "receding": RecedingHorizon(learner, config.memory, config.lookahead),
-        "best": DynamicProgramming(engine, config.steps),
-    }
-    prior = engine.start().marginal("responsive").probs.numpy()
-    start, nats = float(engine.start().entropy()), {}
-    for name, controller in made.items():
-        nats[name] = []
-        for answer in (0, 1):
-            body = Simulated(engine.model, episodes, {"responsive": float(answer)})
-            found = rollout(body, engine, controller, config.steps, seed=config.seed + answer)
-            nats[name].append(start - found.entropy.values)
-    known = {
-        name: np.sum([p * part.mean(0) for p, part in zip(prior, parts, strict=True)], 0)
-        for name, parts in nats.items()
-    }
-    total = {name: float(value.sum()) for name, value in known.items()}
-    pairs = [one.sum(1) - other.sum(1) for one, other in zip(nats["receding"], nats["best"], strict=True)]
-    error = sum(float(p**2 * pair.var() / episodes) for p, pair in zip(prior, pairs, strict=True)) ** 0.5
-    uncertain = {name: start * config.steps - value for name, value in total.items()}
-    summary = {
-        "receding.fraction": total["receding"] / total["best"],
-        "receding.fraction.se": error / total["best"],
-        # The reward itself is minus the uncertainty; of that the best plan's share is this.
-        "receding.reward_fraction": uncertain["best"] / uncertain["receding"],
-        "receding.reward_fraction.se": error / uncertain["receding"],
-        "receding.final_fraction": float(known["receding"][-1] / known["best"][-1]),
-        # What so many episodes make of the best plan, over what it is known to be worth.
-        "best.fraction": total["best"] / (made["best"].plan.value + start * config.steps),
-    }
-    return summary, {f"{name}_information": (("step",), value / np.log(2)) for name, value in known.items()}
-
-
 def _tell(console: Console, config: Any, summary: dict[str, float]) -> None:
     for optimism in config.optimism:
         name = f"optimism_{optimism:g}."
@@ -143,32 +107,27 @@ def _tell(console: Console, config: Any, summary: dict[str, float]) -> None:
             f"{summary[f'{name}td12.fraction']:.2%} of the best; "
             f"calls grow with the horizon to the power {summary[f'{name}power']:.1f}"
         )
-    console.print(
-        f"{config.memory} steps of memory and {config.lookahead} ahead find out {summary['receding.fraction']:.1%} ± "
-        f"{summary['receding.fraction.se']:.1%} of what the best plan over {config.steps} steps does; "
-        f"of its reward it has {summary['receding.reward_fraction']:.2%} ± {summary['receding.reward_fraction.se']:.2%}"
-    )
+    for memory in config.memory:
+        told = {
+            key[len(name) :]: value for key, value in summary.items() if key.startswith(name := f"memory_{memory}.")
+        }
+        reward, known = (_give(told, f"receding.{key}", ".2%") for key in ("reward_fraction", "fraction"))
+        console.print(
+            f"{memory} outcomes remembered and {config.lookahead} steps ahead have, after {config.calls:,} calls, "
+            f"{reward} of the best plan's reward (exact values {told['receding.reward_limit']:.2%}) and {known} of its "
+            f"information ({told['receding.limit']:.2%}); {config.share:.1%} of the reward in "
+            f"{_give(told, 'receding.calls', ',.0f')} calls"
+        )
+    steps = {name: summary[f"accuracy.steps.{name}"] for name in ("best", "infomax", "random", "silent")}
+    said = ", ".join(f"{name} {'not reached' if np.isnan(value) else int(value)}" for name, value in steps.items())
+    parts = ", ".join(f"{summary[f'accuracy.{name}']:.1f} {name}" for name in ("acting", "exploring", "listening"))
+    spent = "" if np.isnan(steps["infomax"]) else f"; of infomax's, {parts}"
+    console.print(f"steps until {config.accuracy.share:.0%} of guesses are right: {said}{spent}")
 
 
-def _draw(found: xr.Dataset, curves: dict[float, list[tuple[int, float]]], config: Any) -> Any:
-    figure, (shares, powers, known) = plt.subplots(1, 3, figsize=(15, 4.2), layout="constrained")
-    for optimism, curve in curves.items():
-        done, share = zip(*curve, strict=True)
-        shares.plot(done, share, label=f"values begin at optimism {optimism:g}")
-    shares.axvline(config.calls, color="grey", ls=":")
-    shares.axhline(config.share, color="grey", ls=":")
-    shares.set(xlabel="calls since birth", ylabel="share of the best 12-step policy", xlim=(0, 1.5 * config.calls))
-    shares.xaxis.set_major_formatter(lambda calls, _: f"{calls / 1000:.0f}k")
-    shares.legend()
-    for optimism in found.optimism.values.tolist():
-        mean = found.calls.sel(optimism=optimism).mean("run")
-        powers.plot(found.horizon, mean, "o-", label=f"optimism {optimism:g}")
-    powers.plot(list(THESIS), list(THESIS.values()), "k^", label="thesis")
-    powers.set(xscale="log", yscale="log", xlabel="steps of a trial", ylabel=f"calls to {config.share:.1%}")
-    powers.legend()
-    steps = np.arange(1, config.steps + 1)
-    known.plot(steps, found.best_information, label=f"best over {config.steps} steps")
-    known.plot(steps, found.receding_information, "--", label=f"{config.memory} remembered, {config.lookahead} ahead")
-    known.set(xlabel="step", ylabel="expected information (bits)")
-    known.legend()
-    return figure
+def _give(summary: dict[str, float], key: str, form: str) -> str:
+    """A number and its error, where it has one."""
+    value, error = summary[key], summary[f"{key}.se"]
+    if np.isnan(value):
+        return "more"
+    return f"{value:{form}}" + ("" if np.isnan(error) else f" ± {error:{form}}")

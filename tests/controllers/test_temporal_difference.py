@@ -85,11 +85,36 @@ def test_what_was_seen_long_ago_is_forgotten(engine):
     assert len(set(controller.act(engine.start(2)).tolist())) == 1
 
 
+def test_stretches_of_sessions_teach_what_a_short_memory_meets(engine):
+    """Every value that the controller asks for comes to be what backward induction says."""
+    learner = TemporalDifference(
+        engine, 5, epsilon=0.3, optimism=0.0, anywhere=True, memory=3, session=20, symmetric=True
+    )
+    best = learner.table.solved(learner.weights)
+    assert best[0, learner.starts, 0].mean() == learner.table.best(learner.weights)
+    done = learner.learn(5000)
+    assert done.sum() == 20 * 5000
+    assert np.allclose(learner.values[0, :, 0], best[0, :, 0], atol=1e-9)
+    assert learner.plan.value == pytest.approx(learner.table.best(learner.weights), abs=1e-9)
+
+
+def test_mirror_images_are_learned_together(engine):
+    twins = []
+    for symmetric in (False, True):
+        learner = TemporalDifference(engine, 5, anywhere=True, session=10, symmetric=symmetric)
+        learner.learn(30)
+        mirror = learner.table.states.index(learner.table.counts[..., ::-1])
+        twins.append(np.array_equal(learner.values, learner.values[:, :, mirror]))
+    assert twins == [False, True]
+
+
 @pytest.mark.parametrize(
     ("made", "words"),
     [
         (lambda e: TemporalDifference(e, 0), "1 step or more"),
         (lambda e: TemporalDifference(e, 3, epsilon=2.0), "epsilon and optimism"),
+        (lambda e: TemporalDifference(e, 3, memory=3), "a memory of fewer, not 3"),
+        (lambda e: TemporalDifference(e, 3, session=9), "a session of as many"),
         (lambda e: RecedingHorizon(TemporalDifference(e, 4), 4, 1), "cannot remember 4 and look 1 ahead"),
         (
             lambda e: RecedingHorizon(TemporalDifference(e, 4), 2, 1).act(e.filter([0, 0], [0.0, 1.0])[-1]),

@@ -61,6 +61,11 @@ def test_baby_9_finds_out(tmp_path):
         (("experiment=contingency/optimal", "between=[30,50]"), "between must lie within"),
         (("experiment=contingency/greedy_never_calls", "episodes=0"), "1 episode"),
         (("experiment=contingency/baby9", "model.window=[3,1]"), "echo must end before"),
+        (("experiment=contingency/learning", "memory=[0]"), "step remembered"),
+        (
+            ("experiment=contingency/learning", "session.steps=5", "quick=true", "horizons=[6]", "calls=100"),
+            "a session",
+        ),
     ],
 )
 def test_what_makes_no_sense_is_one_sentence(tmp_path, words, says):
@@ -73,6 +78,26 @@ def test_it_can_be_learned(tmp_path):
     found, data, said = run(tmp_path, "learning", *words)
     assert found["td6.calls"] < found["td8.calls"] < found["td12.calls"]
     assert found["td12.calls"] < found["optimism_1.td12.calls"]
-    assert 0.5 < found["receding.fraction"] < 1.5 and found["receding.fraction.se"] > 0
-    assert 0.9 < found["receding.reward_fraction"] < 1.1
+    for name in ("", "memory_8."):
+        assert 0.9 < found[f"{name}receding.fraction"] <= found[f"{name}receding.limit"] + 0.005 < 1
+        assert found[f"{name}receding.fraction"] < found[f"{name}receding.reward_fraction"] < 1
+        assert found[f"{name}receding.calls"] <= 20000 + 100 and found[f"{name}receding.calls.se"] is None
+    assert found["best.fraction"] == pytest.approx(1, abs=1e-9)
+    # Nobody is sure so soon; a guess is never better than that of the best plan, and silence tells nothing.
+    assert all(found[f"accuracy.steps.{name}"] is None for name in ("infomax", "best", "random", "silent"))
+    right = {name: data[f"{name}_accuracy"].values for name in ("infomax", "best", "random", "silent")}
+    assert (right["silent"] == pytest.approx(0.5)) and right["random"][-1] < right["infomax"][-1] <= 0.8
+    assert np.allclose(data.spent.sum("doing"), np.arange(1, 21))
     assert data.calls.sizes == {"optimism": 2, "horizon": 3, "run": 1} and "are learned in" in said.replace("\n", " ")
+
+
+def test_somebody_is_identified(tmp_path):
+    words = ("quick=true", "horizons=[6]", "calls=2000", "memory=[4]", "accuracy.share=0.65", "optimism=[0.2]")
+    found, data, said = run(tmp_path, "learning", *words)
+    steps = {name: found[f"accuracy.steps.{name}"] for name in ("infomax", "best", "random", "silent")}
+    assert steps["silent"] is None and steps["random"] is None and steps["best"] <= 20
+    right = data.infomax_accuracy.values
+    reached = int(steps["infomax"])
+    assert right[reached - 1] >= 0.65 > right[reached - 2]
+    spent = [found[f"accuracy.{name}"] for name in ("acting", "exploring", "listening")]
+    assert sum(spent) == pytest.approx(reached) and min(spent) > 0 and "of guesses are right" in said.replace("\n", " ")
