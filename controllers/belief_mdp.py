@@ -12,6 +12,7 @@ from scipy.special import gammaln
 
 from controllers.lattice import Lattice, lattice
 from controllers.rewards import Information
+from controllers.threads import threads_for
 from inference import Engine, Refusal
 
 Array = np.ndarray
@@ -73,7 +74,8 @@ class BeliefMDP:
         whole = gammaln(total[..., None] + np.arange(most)) - gammaln(total)[..., None]
         which = np.zeros(len(process.log_prior), dtype=np.int64) if groups is None else groups.numpy()
         component, logs = process.component.numpy(), process.log_prior.numpy()
-        informed(reward, shares, states.rows, states.packed, logs, which, component, normal, whole)
+        with threads_for(states.size):
+            informed(reward, shares, states.rows, states.packed, logs, which, component, normal, whole)
         if groups is None:
             self._asked(reward, states)
         return reward, shares

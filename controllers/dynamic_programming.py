@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from rich.progress import Progress
 
 from apmodels import ValueOutOfRange
+from apmodels.progress import progress
 from controllers.belief_mdp import BeliefMDP
 from controllers.controller import Controller
 from controllers.plan import Plan, size, solve
@@ -75,7 +75,7 @@ class DynamicProgramming(Controller):
                 f"{limit / 1e9:.2g} GB may be used: shorten the horizon"
             )
         keep = (lambda left: True) if self.steps is None else (lambda left: left == self.horizon)
-        with Progress(transient=True, disable=self.estimate["seconds"] < PATIENCE) as bar:
+        with progress(self.estimate["seconds"] >= PATIENCE) as bar:
             task = bar.add_task("planning", total=self.horizon)
             return solve(self.mdp, self.horizon, self.weights, extra, keep, lambda: bar.advance(task), states)
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from controllers.belief_mdp import BeliefMDP
 from controllers.lattice import Lattice
+from controllers.threads import threads_for
 
 Array = np.ndarray
 
@@ -76,28 +77,31 @@ def solve(
     options = choices.reshape(kinds, actions)
     way = np.ascontiguousarray(moves[:, 0]), np.ascontiguousarray(moves[:, 1])
     layers: dict[int, Array] = {}
-    for left in range(1, horizon + 1):
-        bound = horizon + steps - left
-        weight = weights[horizon - left - 1] if left < horizon else 0.0
-        decided = np.zeros((kinds, states.size if keep(left) else 0), dtype=np.uint8)
-        sweep(
-            values,
-            reward,
-            shares,
-            weight,
-            states.rows,
-            states.layers,
-            bound,
-            states.packed,
-            counted,
-            way,
-            options,
-            decided,
-        )
-        if keep(left):
-            reached = int(states.offset[states.earliest <= bound].max()) + int(_largest(states, bound))
-            layers[left] = np.packbits(decided[:, :reached], axis=1) if actions == 2 else decided[:, :reached].copy()
-        advance()
+    with threads_for(states.size):
+        for left in range(1, horizon + 1):
+            bound = horizon + steps - left
+            weight = weights[horizon - left - 1] if left < horizon else 0.0
+            decided = np.zeros((kinds, states.size if keep(left) else 0), dtype=np.uint8)
+            sweep(
+                values,
+                reward,
+                shares,
+                weight,
+                states.rows,
+                states.layers,
+                bound,
+                states.packed,
+                counted,
+                way,
+                options,
+                decided,
+            )
+            if keep(left):
+                reached = int(states.offset[states.earliest <= bound].max()) + int(_largest(states, bound))
+                layers[left] = (
+                    np.packbits(decided[:, :reached], axis=1) if actions == 2 else decided[:, :reached].copy()
+                )
+            advance()
     value = float(values[mdp.first, 0])
     return Plan(states, horizon, actions, value, layers, time.perf_counter() - begin)
 

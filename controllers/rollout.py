@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from rich.progress import Progress
 from torch import Tensor
 
 from apmodels import ValueOutOfRange
+from apmodels.progress import progress
 from apmodels.simulation import as_dict
 from controllers.controller import Controller
 from inference import Belief, Engine, Marginal
@@ -75,7 +75,7 @@ def rollout(
 
 
 def _progress(stack: contextlib.ExitStack, steps: int, done: int) -> Callable[[], None]:
-    bar = stack.enter_context(Progress(transient=True))
+    bar = stack.enter_context(progress())
     task = bar.add_task("rolling out", total=steps, completed=done)
     return lambda: bar.advance(task)
 

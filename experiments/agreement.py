@@ -11,11 +11,11 @@ import numpy as np
 import xarray as xr
 from matplotlib.colors import LogNorm
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
 from apmodels import ValueOutOfRange
 from apmodels.errors import nearest
+from apmodels.progress import progress
 from experiments.agreement_models import models
 from experiments.study import Result
 from inference.brute_force.reference import reference
@@ -51,7 +51,7 @@ def _figures(config: Any, folder: Path, chosen: dict[str, Any]) -> dict[str, Any
     path = folder / KEPT
     kept = json.loads(path.read_text()) if path.exists() else {}
     figures = kept.get("figures", {}) if kept.get("setting") == setting else {}
-    with Progress(transient=True) as bar:
+    with progress() as bar:
         task = bar.add_task("agreeing", total=len(chosen))
         for name, model in chosen.items():
             bar.update(task, description=name)

@@ -15,9 +15,9 @@ import torch
 import xarray as xr
 from hydra.utils import instantiate
 from rich.console import Console
-from rich.progress import track
 
 from apmodels import Model, ValueOutOfRange
+from apmodels.progress import tracked
 from controllers import DynamicProgramming, GreedyInfomax, belief_mdp, rollout
 from controllers.dynamic_programming import SHARES
 from controllers.lattice import visited
@@ -61,7 +61,7 @@ def _valued(model: Model, chosen: list[int]) -> dict[str, list[float]]:
     mdp = belief_mdp(Exact(model, torch.float64))
     prior = float(mdp.engine.start().entropy())
     found: dict[str, list[float]] = {"final_information": [], "mean_information": []}
-    for horizon in track(chosen, "planning", transient=True):
+    for horizon in tracked(chosen, "planning"):
         final = solve(mdp, horizon, SHARES["terminal"](horizon), keep=lambda left: False).value
         summed = solve(mdp, horizon, SHARES["summed"](horizon), keep=lambda left: False).value
         found["final_information"].append((prior + final) / BITS)
@@ -71,7 +71,7 @@ def _valued(model: Model, chosen: list[int]) -> dict[str, list[float]]:
 
 def _costs(model: Model, timed: list[int]) -> dict[str, list[float]]:
     found: dict[str, list[float]] = {"seconds": [], "peak_gb": [], "states": []}
-    for horizon in track(timed, "timing", transient=True):
+    for horizon in tracked(timed, "timing"):
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
             for name, value in pool.submit(cost, model, horizon).result().items():
                 found[name].append(value)

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from rich.progress import track
 from torch import Tensor
 
 from apmodels import Model, ValueOutOfRange
+from apmodels.progress import tracked
 from apmodels.simulation import Values, as_given, seeded
 from inference.beliefs import Marginal
 from inference.brute_force.reference import WORLDS, Reference, reference
@@ -119,9 +119,9 @@ def check(
         raise Refusal(f"no engine can serve {type(model).__name__}: " + "; ".join(b.reason for b in made.values()))
     names = list(model.structure.interest)
     data = [simulated(model, steps, seed + i, missing) for i in range(records)]
-    truths = [reference(model, *record, names, worlds) for record in track(data, "brute force", transient=True)]
+    truths = [reference(model, *record, names, worlds) for record in tracked(data, "brute force")]
     rows = []
-    for name in track(serving, "engines", transient=True):
+    for name in tracked(serving, "engines"):
         rows += compare(model, name, data, truths)
     refusals = {name: made[name].reason for name in wanted if not made[name]}
     return Report(repr(model), truths[0].method, tuple(rows), refusals)

@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from rich.progress import Progress
 from scipy.optimize import minimize
 from torch import Tensor
 from torch.distributions import biject_to, constraints
 
 from apmodels import DeclarationError, Model, ValueOutOfRange
 from apmodels.errors import nearest
+from apmodels.progress import progress
 from apmodels.simulation import Values, as_given
 from inference.choose import bids
 from inference.counting_fit import counted
@@ -149,7 +149,7 @@ def _climb(
             best[:] = [-now, {name: value.detach().clone() for name, value in free.items()}]
         return now, slope
 
-    with Progress(transient=True) as bar:
+    with progress() as bar:
         task = bar.add_task("fitting", total=rounds)
 
         def after(_: np.ndarray) -> None:

@@ -17,10 +17,10 @@ import torch
 from pyro import poutine
 from pyro.infer import SVI, Trace_ELBO, TraceEnum_ELBO
 from pyro.infer.autoguide import AutoMultivariateNormal, AutoNormal
-from rich.progress import track
 from torch import Tensor
 
 from apmodels import Model, ValueOutOfRange
+from apmodels.progress import tracked
 from apmodels.simulation import Values, as_given, seeded
 from apmodels.structure import Structure
 from inference.answers.draws import draw_values
@@ -206,7 +206,7 @@ class Variational(Engine):
         svi = SVI(program, guide, pyro.optim.ClippedAdam(rate), loss=elbo)  # type: ignore[attr-defined]
         warm = any("parameters" in b.kept for b in line(belief))
         many = max(self.iterations // 4, 1) if warm else self.iterations
-        rounds = track(range(many), "fitting", transient=True) if many * belief.time > LONG else range(many)
+        rounds = tracked(range(many), "fitting") if many * belief.time > LONG else range(many)
         for _ in rounds:
             value: Any = svi.step()
             if not math.isfinite(value):

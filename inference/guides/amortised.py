@@ -10,11 +10,11 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from rich.progress import track
 from torch import Tensor, nn
 from torch.distributions import biject_to
 
 from apmodels.distributions import base_of
+from apmodels.progress import tracked
 from apmodels.simulation import Values
 from inference.guides.posterior_draws import Proposal
 
@@ -49,7 +49,7 @@ class Amortised(nn.Module):
         optimiser = torch.optim.Adam(self.parameters(), rate)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, rounds)
         losses = []
-        for k in track(range(rounds), "learning", transient=True):
+        for k in tracked(range(rounds), "learning"):
             length = 1 + (k * 7919) % steps
             record = self.model.simulate(length, batch=records, seed=seed + k)
             loss = -self._likely(record).mean()

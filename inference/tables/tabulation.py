@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import torch
-from rich.progress import track
 from torch import Tensor
 
 from apmodels.distributions import tensors, with_tensors
 from apmodels.laws import Laws
+from apmodels.progress import tracked
 from inference.tables.contexts import Contexts
 from inference.tables.families import tabulate
 from inference.tables.layout import Layout
@@ -73,7 +73,7 @@ class Tabulation:
         largest = max(torch.Size(nodes[name].shape).numel() for name in self.names)
         step = max(1, CHUNK // max(1, largest * torch.Size(self.layout.sizes).numel()))
         starts = range(0, count, step)
-        for start in track(starts, "tabulating", transient=True) if len(starts) > 3 else starts:
+        for start in tracked(starts, "tabulating") if len(starts) > 3 else starts:
             part = {key: value[start : start + step] for key, value in (context or {}).items()}
             mesh = Slice(self.laws, self.layout.step_axes, part)
             self._append_transitions(mesh)
