@@ -24,6 +24,7 @@ from apmodels.transforms import shift as shift
 from apmodels.transforms import where as where
 from apmodels.transforms import window as window
 from apmodels.transforms import zeros as zeros
+from apmodels.uncertain_window import UncertainWindow as UncertainWindow
 from apmodels.variables import action as action
 from apmodels.variables import interest as interest
 from apmodels.variables import observation as observation

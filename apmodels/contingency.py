@@ -53,6 +53,9 @@ class Contingency(Model):
                 f"{self.window[1]} steps after a call; the echo must end before answers begin"
             )
 
+        if not isinstance(self.period, (int, float)) or not self.period > 0:
+            raise ValueOutOfRange(f"a period is seconds, and more than none, not {self.period}")
+
     @static
     def responsive(self):
         """Whether somebody answers."""

@@ -157,13 +157,13 @@ def cast(thing: Any, dtype: torch.dtype) -> Any:
         return thing
     fields = [field.name for field in dataclasses.fields(thing) if field.init]
     changed = {name: cast(getattr(thing, name), dtype) for name in fields}
-    if all(new is getattr(thing, name) or _same(new, getattr(thing, name)) for name, new in changed.items()):
+    if all(_same(new, getattr(thing, name)) for name, new in changed.items()):
         return thing
     return dataclasses.replace(thing, **changed)
 
 
 def _same(a: Any, b: Any) -> bool:
-    return isinstance(a, tuple) and isinstance(b, tuple) and all(x is y for x, y in zip(a, b, strict=True))
+    return a is b or (isinstance(a, tuple) and all(_same(x, y) for x, y in zip(a, b, strict=True)))
 
 
 def _drop_single(value: Tensor, dims: int) -> Tensor:

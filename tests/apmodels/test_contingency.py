@@ -51,3 +51,9 @@ def test_the_posterior_odds_are_those_of_the_appendix(first, more, wait, presenc
 def test_an_echo_must_end_before_answers_begin(echo, window):
     with pytest.raises(ValueOutOfRange, match="the echo must end before answers begin"):
         Contingency(echo=echo, window=window)
+
+
+@pytest.mark.parametrize("period", [0, -1.0, "a while"])
+def test_a_period_takes_time(period):
+    with pytest.raises(ValueOutOfRange, match="a period is seconds"):
+        Contingency(period=period)

@@ -21,6 +21,7 @@ from apmodels import (
     ValueOutOfRange,
     VisualSearch,
     action,
+    laws,
     observation,
     ones,
     static,
@@ -524,3 +525,15 @@ def test_the_explanation_says_what_the_model_is_and_what_is_done():
     assert "known to the agent, by computing: timer" in str(Contingency().explain())
     assert "Joint(drift" in str(Joint().explain()).splitlines()[0]
     ET.fromstring(f"<div>{RandomWalk().explain()._repr_html_()}</div>")
+
+
+class Nested(RandomWalk):
+    # A table of a table: what holds floating-point tensors at any depth is cast once, and only once.
+    rates: tuple = ((0.1, ones(2)), (0.3, ones(2)))
+
+
+def test_tuples_of_tuples_are_fields():
+    assert len(Nested().simulate(3, seed=0)["reading"]) == 3
+    doubled = laws.cast(Nested(), torch.float64)
+    assert doubled.rates[0][1].dtype == torch.float64 and doubled.rates[1][0] == 0.3
+    assert laws.cast(doubled, torch.float64) is doubled
