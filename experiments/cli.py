@@ -14,6 +14,7 @@ from rich.console import Console
 
 # First word -> (function, what it does). A tool takes the remaining words.
 TOOLS: dict[str, tuple[str, str]] = {
+    "contingency": ("experiments.contingency_listen:main", "was anybody answering, in a recording and its calls?"),
     "data": ("experiments.data.__main__:main", "fetch the real data that studies and tests use"),
 }
 GROUPS = ("model", "engine", "controller", "body", "launcher")
@@ -119,7 +120,7 @@ def run(config: Any) -> None:
         # The whole message quotes the cause, and names the class and the key.
         fail(str(error.__cause__ or error))
     except (ValueError, OSError, TypeError) as error:
-        if not _is_users(error):
+        if not is_users(error):
             raise
         fail(str(error))
     for path in paths:
@@ -132,13 +133,13 @@ def fail(message: str, code: int = 2) -> None:
     sys.exit(code)
 
 
-def _is_users(error: BaseException) -> bool:
+def is_users(error: BaseException) -> bool:
     """Whether an error speaks to a user; anything else is our mistake, and keeps its traceback."""
     from apmodels import DeclarationError, ValueOutOfRange
-    from hardware import PhotoError
+    from hardware import PhotoError, SoundError
     from inference import Refusal
 
-    return isinstance(error, (PhotoError, Refusal, DeclarationError, ValueOutOfRange, OSError))
+    return isinstance(error, (PhotoError, SoundError, Refusal, DeclarationError, ValueOutOfRange, OSError))
 
 
 def _near(path: Path) -> str:

@@ -17,6 +17,18 @@ if TYPE_CHECKING:
     from hardware.photo_eye import whole_image as whole_image
     from hardware.simulated import Simulated as Simulated
 
+    # Sound.
+    from hardware.sound import Microphone as Microphone
+    from hardware.sound import SoundError as SoundError
+    from hardware.sound import Speaker as Speaker
+    from hardware.sound_booth import SoundBooth as SoundBooth
+    from hardware.sound_card import SoundCard as SoundCard
+    from hardware.sound_file import SoundFile as SoundFile
+    from hardware.sound_file import read_sound as read_sound
+    from hardware.two_means import TwoMeans as TwoMeans
+    from hardware.virtual_room import Caregiver as Caregiver
+    from hardware.virtual_room import VirtualRoom as VirtualRoom
+
 # Public names and their files.  They are imported when first used, so that `import hardware` is quick.
 _FILES = {
     "Body": "body",
@@ -30,6 +42,17 @@ _FILES = {
     "read_photo": "photo",
     "PhotoEye": "photo_eye",
     "whole_image": "photo_eye",
+    # Sound.
+    "Microphone": "sound",
+    "SoundError": "sound",
+    "Speaker": "sound",
+    "SoundBooth": "sound_booth",
+    "SoundCard": "sound_card",
+    "SoundFile": "sound_file",
+    "read_sound": "sound_file",
+    "TwoMeans": "two_means",
+    "Caregiver": "virtual_room",
+    "VirtualRoom": "virtual_room",
 }
 
 
