@@ -17,7 +17,7 @@ from controllers import TemporalDifference
 from experiments.contingency_accuracy import identify
 from experiments.contingency_learning_figure import draw
 from experiments.contingency_receding import recede
-from experiments.study import Result
+from experiments.study import Result, remembered
 from inference import Exact
 
 # The thesis's calls to convergence, by steps of a trial.
@@ -38,7 +38,15 @@ def learning(config: Any, folder: Path, console: Console) -> Result:
     curves: dict[float, list[tuple[int, float]]] = {}
     within = np.zeros((len(config.optimism), runs))
     for i, j, r in tracked(jobs, "learning"):
-        curve = _learned(engine, chosen[j] - 1, config, config.optimism[i], config.seed + r)
+        optimism, seed = config.optimism[i], config.seed + r
+        setting = [repr(engine), chosen[j], optimism, config.epsilon, config.share, config.calls, seed]
+        part = remembered(
+            folder,
+            f"curve_{optimism:g}_{chosen[j]}_{r}",
+            setting,
+            lambda at=(chosen[j] - 1, optimism, seed): _learned(engine, config, *at),
+        )
+        curve = list(zip(part.done.values.tolist(), part.part.values.tolist(), strict=True))
         calls[i, j, r] = next(done for done, share in curve if share >= config.share)
         if chosen[j] == 12:
             curves.setdefault(config.optimism[i], curve)
@@ -64,8 +72,8 @@ def _check(config: Any) -> None:
         )
 
 
-def _learned(engine: Any, actions: int, config: Any, optimism: float, seed: int) -> list[tuple[int, float]]:
-    """(Calls so far, share of the best policy's information), until enough is learned and enough calls were made."""
+def _learned(engine: Any, config: Any, actions: int, optimism: float, seed: int) -> xr.Dataset:
+    """Calls so far and the share of the best policy's information, until enough is learned and calls were made."""
     learner = TemporalDifference(engine, actions, epsilon=config.epsilon, optimism=optimism, anywhere=True, seed=seed)
     nothing = -float(engine.start().entropy()) * actions
     best = learner.table.best(learner.weights) - nothing
@@ -75,7 +83,8 @@ def _learned(engine: Any, actions: int, config: Any, optimism: float, seed: int)
         curve.append((done, (learner.plan.value - nothing) / best))
         if done > PATIENCE:
             raise ValueOutOfRange(f"nothing was learned in {done:,} calls; try another optimism, or epsilon above 0")
-    return curve
+    calls, shares = zip(*curve, strict=True)
+    return xr.Dataset({"done": (("look",), list(calls)), "part": (("look",), list(shares))})
 
 
 def _within(curve: list[tuple[int, float]], calls: int) -> float:

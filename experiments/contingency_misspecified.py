@@ -21,7 +21,7 @@ from apmodels import Contingency, ValueOutOfRange, observation, state, static
 from apmodels.progress import tracked
 from apmodels.transforms import where
 from controllers import Controller, DynamicProgramming, Playback, rollout
-from experiments.study import Result
+from experiments.study import Result, remembered
 from hardware import Simulated
 from inference import Engine, Exact
 
@@ -220,9 +220,26 @@ def misspecified(config: Any, folder: Path, console: Console) -> Result:
     courses: dict[tuple[str, str, str], np.ndarray] = {}
     for world in tracked(worlds, "listening"):
         for rates in RATES:
-            for name, sessions in agents.sessions(world, rates, episodes, config.seed):
-                measured[world.name, rates, name] = sessions.measures(config.decided)
-                courses[world.name, rates, name] = sessions.belief.mean(0)
+            setting = [
+                repr(model),
+                repr(world.model),
+                world.rates,
+                steps,
+                horizon,
+                episodes,
+                config.decided,
+                config.seed,
+            ]
+            part = remembered(
+                folder,
+                f"{world.name}.{rates}",
+                [*setting, list(config.every), config.decided, config.seed],
+                lambda world=world, rates=rates: agents.part(world, rates, episodes, config),
+            )
+            for name in part.attrs["agents"].split():
+                own = {str(key).split(":")[1]: key for key in part if str(key).startswith(f"{name}:")}
+                measured[world.name, rates, name] = {key: part[variable].values for key, variable in own.items()}
+                courses[world.name, rates, name] = measured[world.name, rates, name].pop("course")
     data = _dataset(measured, courses, [w.name for w in worlds], agents.names)
     data.attrs = {"model": repr(model), "steps": steps, "horizon": horizon}
     summary = _summary(data, worlds, model)
@@ -271,6 +288,17 @@ class _Agents:
         if repr(model) not in self.plans:
             self.plans[repr(model)] = DynamicProgramming(self._engine(model), self.horizon, steps=self.steps)
         return self.plans[repr(model)]
+
+    def part(self, world: World, rates: str, episodes: int, config: Any) -> xr.Dataset:
+        """Return what all agents make of a world: every measure of every session, and the mean course of P(truth)."""
+        variables: dict[str, Any] = {}
+        names = []
+        for name, sessions in self.sessions(world, rates, episodes, config.seed):
+            names.append(name)
+            measures = sessions.measures(config.decided)
+            variables |= {f"{name}:{key}": (("session",), value) for key, value in measures.items()}
+            variables[f"{name}:course"] = (("time",), sessions.belief.mean(0))
+        return xr.Dataset(variables, attrs={"agents": " ".join(names)})
 
     def sessions(self, world: World, rates: str, episodes: int, seed: int) -> Iterator[tuple[str, Sessions]]:
         """Yield agents' names and sessions; all begin with the same seed, so that differences are paired.

@@ -17,7 +17,7 @@ from apmodels import ValueOutOfRange
 from apmodels.progress import progress
 from controllers import Constant, DynamicProgramming, Handover, Playback, rollout
 from experiments.sounds import RATE, conversation, utterances
-from experiments.study import Result
+from experiments.study import Result, remembered
 from hardware import Caregiver, SoundBooth, TwoMeans, VirtualRoom
 from inference import Exact
 
@@ -38,9 +38,14 @@ def room(config: Any, folder: Path, console: Console) -> Result:
     kept: dict[str, list[xr.Dataset]] = {}
     with progress() as bar:
         for name in bar.track(list(config.rooms), description="sessions"):
-            told = hall.told(name)
+            told = remembered(folder, f"{name}.told", hall.setting(name), lambda name=name: hall.told(name))
             for patience in listen:
-                data = hall.sessions(name, patience).merge(told)
+                data = remembered(
+                    folder,
+                    f"{name}.listen_{patience}",
+                    hall.setting(name),
+                    lambda name=name, patience=patience: hall.sessions(name, patience),
+                ).merge(told)
                 kept.setdefault(name, []).append(data)
                 scores = _scores(data, patience + config.glance)
                 for prefix in (f"{name}.listen_{patience}", *([name] if patience == listen[-1] else [])):
@@ -77,6 +82,11 @@ class Hall:
             # What is wrong with a room is better said before planning than after.
             self.body(name, True)
         self.plan = DynamicProgramming(self.engine, min(config.horizon, steps), steps=steps)
+
+    def setting(self, name: str) -> str:
+        """Return all that sessions in a room depend on, but for how long it is listened to."""
+        parts = ("model", "judge", "horizon", "certain", "half", "exponent", "check", "seed")
+        return repr([*(str(self.config[part]) for part in parts), str(self.config.rooms[name]), self.count, self.steps])
 
     def body(self, name: str, *answered: bool) -> SoundBooth:
         """Return a booth in as many rooms in which calls are answered, or not, as there are sessions, for each."""

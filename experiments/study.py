@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,26 @@ class Result:
         text = json.dumps({key: _plain(value) for key, value in self.summary.items()}, indent=2) + "\n"
         paths.append(_whole(folder / "summary.json", lambda path: path.write_text(text)))
         return paths
+
+
+def remembered(folder: Path, name: str, setting: Any, make: Callable[[], xr.Dataset]) -> xr.Dataset:
+    """Return a part of a long study, from the folder's ``parts`` if an earlier run in it made it, or made now.
+
+    Args:
+        folder: the study's.
+        name: the part's, a file's name without ending.
+        setting: all that the part depends on, as text; a part of another setting is made anew.
+        make: makes it.
+    """
+    path = folder / "parts" / f"{name}.nc"
+    if path.exists():
+        kept = xr.load_dataset(path, engine="h5netcdf")
+        if kept.attrs.get("setting") == str(setting):
+            return kept
+    made = make().assign_attrs(setting=str(setting))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _whole(path, lambda part: made.to_netcdf(part, engine="h5netcdf"))
+    return made
 
 
 def _whole(path: Path, write: Any) -> Path:

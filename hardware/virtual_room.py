@@ -117,20 +117,23 @@ class VirtualRoom:
         """Return what is heard next, (batch, samples) float32."""
         if self.caregiver is not None and self.present:
             self._talk(samples)
-        time = np.arange(samples)
         heard = self.noise * self.random.standard_normal((self.batch, samples), dtype=np.float32)
         if self.loop is not None:
-            heard += self.loop[(self.offset[:, None] + self.now + time) % len(self.loop)]
-        heard += _from(self.echo, self.now - self.called[:, None] + time)
+            round_again = np.resize(self.loop, (1, len(self.loop) + samples))
+            heard += _parts(round_again, 0, (self.offset + self.now) % len(self.loop), samples)
+        self._add(heard, self.echo[None], np.zeros(self.batch, dtype=int), self.called)
         for slot in range(SLOTS):
-            since = self.now - self.begins[:, slot]
-            rows = np.flatnonzero((since > -samples) & (since < self.lengths[self.says[:, slot]]))
-            place = since[rows, None] + time
-            inside = (place >= 0) & (place < self.bank.shape[1])
-            sounds = self.bank[self.says[rows, slot, None], np.clip(place, 0, self.bank.shape[1] - 1)]
-            heard[rows] += np.where(inside, sounds, 0)
+            self._add(heard, self.bank, self.says[:, slot], self.begins[:, slot])
         self.now += samples
         return np.clip(heard, -1, 1, out=heard)
+
+    def _add(self, heard: np.ndarray, sounds: np.ndarray, which: np.ndarray, begins: np.ndarray) -> None:
+        """Add what is to be heard now of sounds (K, samples), each of which (batch,) begins at a time (batch,)."""
+        samples, since = heard.shape[1], self.now - begins
+        rows = np.flatnonzero((since > -samples) & (since < sounds.shape[1]))
+        if len(rows):
+            padded = np.pad(sounds, ((0, 0), (samples, samples)))
+            heard[rows] += _parts(padded, which[rows], since[rows] + samples, samples)
 
     def _talk(self, samples: int) -> None:
         """Who does not respond talks all the same, at times of her own."""
@@ -178,7 +181,6 @@ def _bank(utterances: Sequence[np.ndarray], level: float) -> tuple[np.ndarray, n
     return bank, lengths
 
 
-def _from(sound: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Samples of a sound at these places, silence before and after it."""
-    inside = (place >= 0) & (place < len(sound))
-    return np.where(inside, sound[np.clip(place, 0, len(sound) - 1)], np.float32(0))
+def _parts(sounds: np.ndarray, which: np.ndarray | int, first: np.ndarray, samples: int) -> np.ndarray:
+    """Return as many samples of sounds (K, samples) from places on, (n, samples)."""
+    return np.lib.stride_tricks.sliding_window_view(sounds, samples, axis=1)[which, first]
