@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import queue
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -88,10 +89,9 @@ class SoundCard:
 
 def _library() -> Any:
     try:
-        import sounddevice
+        return import_module("sounddevice")
     except ImportError:
         raise SoundError("Sound devices need the extra 'hardware': pip install 'apmodels[hardware]'.") from None
     except OSError as error:
         # The package is there, and the system's library, which it needs on Linux, is not.
         raise SoundError(f"Sound devices cannot be used here: {error}; on Debian, install libportaudio2.") from None
-    return sounddevice
