@@ -6,6 +6,10 @@ here too, one file each.
 
 from apmodels.acuity import Acuity as Acuity
 from apmodels.acuity import Calibrated as Calibrated
+from apmodels.acuity import Camera as Camera
+from apmodels.acuity import Exponential as Exponential
+from apmodels.acuity import Human as Human
+from apmodels.acuity import HumanContrast as HumanContrast
 from apmodels.contingency import Contingency as Contingency
 from apmodels.detector_search import CountModel as CountModel
 from apmodels.detector_search import DetectorSearch as DetectorSearch
@@ -31,3 +35,4 @@ from apmodels.variables import observation as observation
 from apmodels.variables import state as state
 from apmodels.variables import static as static
 from apmodels.visual_search import VisualSearch as VisualSearch
+from apmodels.wandering_search import WanderingSearch as WanderingSearch

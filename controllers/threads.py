@@ -26,3 +26,14 @@ def threads_for(values: int) -> Iterator[None]:
     finally:
         numba.set_num_threads(ours)
         torch.set_num_threads(torchs)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch work in one thread: in many small steps threads wait for each other longer than they work."""
+    torchs = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(torchs)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -98,6 +98,45 @@ class Engine(ABC):
         ``actions`` (K, *shape), all values of a finite action by default. Exact where the observation has few
         outcomes, otherwise an average over ``samples`` imagined observations, with common random numbers.
         """
+
+    def expect(
+        self,
+        belief: Any,
+        worth: Callable[[Tensor], Tensor],
+        actions: Any = None,
+        samples: int = 64,
+        seed: int = 0,
+    ) -> Tensor:
+        """Return what a function of the next belief about the interest is expected to be, (*batch, K), after K actions.
+
+        ``worth`` takes the log probabilities of the interest's values, (N, n), and returns (N,). Imagines as ``gain``
+        does: where it is minus the entropy, what is returned is the gain minus the entropy before.
+
+        Raises:
+            Refusal: the interest has no finite list of values.
+        """
+        raise Refusal(f"{type(self).__name__} imagines no beliefs about the interest")
+
+    def imagine(self, belief: Any, action: Any, samples: int = 64, seed: int = 0) -> tuple[Values, Tensor]:
+        """Return what a batch of B beliefs may see next, each after its own action, and how probable that is.
+
+        Returns:
+            Observations (B, S, *shape) by name, and weights (B, S): all outcomes with their probabilities where there
+            are ``samples`` of them or fewer; else as many draws of equal weight, with common random numbers.
+        """
+        raise Refusal(f"{type(self).__name__} imagines no observations")
+
+    def best_guess(self, belief: Any, actions: Any = None, samples: int = 64, seed: int = 0) -> Tensor:
+        """Return how probable the interest's most probable value is expected to be, (*batch, K), after K actions."""
+        return self.expect(belief, lambda logs: logs.amax(-1).exp(), actions, samples, seed)
+
+    def discriminability(self, belief: Any, actions: Any = None) -> Tensor:
+        """Return sum over the interest's values i of B_i d'²(i, action), (*batch, K), after K actions.
+
+        Raises:
+            Refusal: the engine tabulates no laws, or they have no baseline that the hypotheses share.
+        """
+        raise Refusal(f"{type(self).__name__} has no table of laws to read d' from; use Exact, where it bids")
 
     def filter(self, actions: Any, observations: Any, batch: int | None = None) -> Sequence[Any]:
         """Return the beliefs after each step of a record, (steps, *shape) or (batch, steps, *shape).

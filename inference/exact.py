@@ -20,7 +20,9 @@ from inference.beliefs import FiniteBelief, Marginal
 from inference.engine import Bid, Engine
 from inference.records.finite_record import along
 from inference.records.record import Record
-from inference.tables.imagining import information_gain
+from inference.tables.best_guess import best_guess
+from inference.tables.discriminability import discriminability
+from inference.tables.imagining import Worth, expectation, imagine, information_gain
 from inference.tables.layout import Layout
 from inference.tables.projections import Projections
 from inference.tables.slices import Axis, Context, Slice, contract
@@ -76,16 +78,22 @@ class Exact(Engine):
         if batch is not None and batch < 1:
             raise ValueOutOfRange(f"a batch of {batch} beliefs is empty; give 1 or more, or None")
         rows = 1 if batch is None else batch
-        mesh = Slice(self.laws, self.layout.axes, {})
-        log_probs = torch.zeros((1,) * (1 + len(self.layout.axes)), dtype=self.dtype)
-        for axis in self.layout.statics:
-            log_probs = log_probs + mesh.transition(axis)
-        for axis in self.layout.states:
-            log_probs = log_probs + self._before(mesh, axis)
-        log_probs = log_probs.expand(rows, *self.layout.sizes).contiguous()
+        log_probs = self._prior().expand(rows, *self.layout.sizes).contiguous()
         known = self.known.first(rows)
         evidence = torch.zeros(() if batch is None else rows, dtype=self.dtype)
         return FiniteBelief(self, batch, 0, evidence, known, log_probs)
+
+    def _prior(self) -> Tensor:
+        """Log probabilities before the first step, (1, *sizes or 1)."""
+        layout = self.layout
+        mesh = Slice(self.laws, layout.spent + layout.axes, {})
+        log_probs = torch.zeros((1,) * (1 + len(mesh.axes)), dtype=self.dtype)
+        for axis in layout.spent + layout.statics:
+            log_probs = log_probs + mesh.transition(axis)
+        for axis in layout.states:
+            log_probs = log_probs + self._before(mesh, axis)
+        gone = list(range(1, 1 + len(layout.spent)))
+        return log_probs.logsumexp(gone) if gone else log_probs
 
     def update(self, belief: FiniteBelief, action: Any, observation: Any) -> FiniteBelief:
         """Return the belief after one more action and observation (thesis eqs 5.11 and 5.12)."""
@@ -150,6 +158,24 @@ class Exact(Engine):
     def gain(self, belief: FiniteBelief, actions: Any = None, samples: int = 64, seed: int = 0) -> Tensor:
         """Return the expected information about the interest, nats, (*batch, K) (thesis eq. 5.4)."""
         return information_gain(self, belief, actions, samples, seed)
+
+    def expect(
+        self, belief: FiniteBelief, worth: Worth, actions: Any = None, samples: int = 64, seed: int = 0
+    ) -> Tensor:
+        """Return the expectation of a function of the next belief about the interest, (*batch, K)."""
+        return expectation(self, belief, worth, actions, samples, seed)
+
+    def imagine(self, belief: FiniteBelief, action: Any, samples: int = 64, seed: int = 0) -> tuple[Values, Tensor]:
+        """Return what may be seen next, (B, S, *shape) by name, and how probable each is, (B, S)."""
+        return imagine(self, belief, self._actions(action, len(belief.log_probs)), samples, seed)
+
+    def best_guess(self, belief: FiniteBelief, actions: Any = None, samples: int = 64, seed: int = 0) -> Tensor:
+        """Return how probable the interest's most probable value is expected to be, (*batch, K)."""
+        return best_guess(self, belief, actions, samples, seed)
+
+    def discriminability(self, belief: FiniteBelief, actions: Any = None) -> Tensor:
+        """Return the expected squared distance, d'², between what is seen and what is not about, (*batch, K)."""
+        return discriminability(self, belief, actions)
 
     def prepare(self) -> Exact:
         """Tabulate the laws for every action now, and return self."""

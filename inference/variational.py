@@ -161,6 +161,12 @@ class Variational(Engine):
         """Return the expected information about the interest, nats, (*batch, K), from draws of the posterior."""
         return self.loose.gain(self.cloud(belief), actions, samples, seed)
 
+    def expect(
+        self, belief: VariationalBelief, worth: Any, actions: Any = None, samples: int = 64, seed: int = 0
+    ) -> Tensor:
+        """Return the expectation of a function of the next belief about the interest, from draws of the posterior."""
+        return self.loose.expect(self.cloud(belief), worth, actions, samples, seed)
+
     def cloud(self, belief: VariationalBelief) -> BankBelief:
         """Return the posterior as particles of everything."""
         found = self.posterior(belief)

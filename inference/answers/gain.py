@@ -6,6 +6,7 @@ seen where these are few; as an average over imagined observations, with common 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +15,8 @@ from torch import Tensor
 
 from apmodels.simulation import Values, seeded
 from inference.answers.draws import draw_values
-from inference.answers.outcomes import ranged
+from inference.answers.outcomes import outcomes, ranged
+from inference.engine import Refusal
 from inference.tables.imagining import choices
 from inference.tables.table import FEW_OUTCOMES
 from inference.worlds.gaussian_block import predicted
@@ -26,18 +28,60 @@ CHUNK, DRAWS = 4_000_000, 1024
 
 def information_gain(engine: Any, belief: Any, actions: Any, samples: int, seed: int) -> Tensor:
     """Return I(interest; next observation | action), nats, (*batch, K)."""
+    return _each(engine, belief, actions, seed, lambda chosen: _gain(engine, belief, chosen, samples).clamp(min=0))
+
+
+def expectation(
+    engine: Any, belief: Any, worth: Callable[[Tensor], Tensor], actions: Any, samples: int, seed: int
+) -> Tensor:
+    """Return E[worth(the next belief about the interest) | action], (*batch, K); Refusal where that is no list."""
+    names = engine.names(None)
+    for name in names:
+        if not ranged(engine, name):
+            raise Refusal(f"{name} has no finite list of values, so there is no list of their probabilities")
+
+    def expected(chosen: Values) -> Tensor:
+        step, known = _moved(engine, belief, chosen)
+        return _ahead(
+            engine, belief, step, known | chosen, samples, lambda after: worth(outcomes(engine, after, names)[1])
+        )
+
+    return _each(engine, belief, actions, seed, expected)
+
+
+def imagine(engine: Any, belief: Any, actions: Values, samples: int, seed: int) -> tuple[Values, Tensor]:
+    """Return observations (B, S, *shape) by name, and how probable each is, (B, S); see ``Engine.imagine``."""
+    rows = len(belief.log_weights)
+    with seeded(seed):
+        step, known = _moved(engine, belief, actions)
+        found = _all_outcomes(engine)
+        count = 0 if found is None else len(next(iter(found.values())))
+        if found is None or count > samples:
+            seen = imagined(engine, step, belief.log_weights, samples)
+            seen = {name: v.reshape(rows, samples, *v.shape[2:]) for name, v in seen.items()}
+            return seen, torch.full((rows, samples), 1 / samples, dtype=engine.dtype)
+    seen = {name: v.to(engine.dtype).expand(rows, *v.shape) for name, v in found.items()}
+    index = torch.arange(rows).repeat_interleave(count)
+    part = {name: v.flatten(0, 1)[:, None] for name, v in seen.items()}
+    context = {name: v[index] for name, v in (known | actions).items()}
+    after = _after(engine, take_belief(belief, index), take_rows(step, index), context, part)
+    return seen, after.log_evidence.exp().reshape(rows, count)
+
+
+def _each(engine: Any, belief: Any, actions: Any, seed: int, answer: Callable[[Values], Tensor]) -> Tensor:
+    """Return what each of K actions is answered, (rows,), as (*batch, K)."""
     acts = choices(engine, actions)
     many = len(next(iter(acts.values()))) if acts else 1
-    gains = []
+    found = []
     for k in range(many):
         chosen = {
             name: value[k : k + 1].expand(len(belief.log_weights), *value.shape[1:]) for name, value in acts.items()
         }
-        # The same seed for every action: differences between actions are much surer than the gains themselves.
+        # The same seed for every action: differences between actions are much surer than the answers themselves.
         with seeded(seed):
-            gains.append(_gain(engine, belief, chosen, samples))
-    gain = torch.stack(gains, 1).clamp(min=0)
-    return gain[0] if belief.batch is None else gain
+            found.append(answer(chosen))
+    answers = torch.stack(found, 1)
+    return answers[0] if belief.batch is None else answers
 
 
 def _gain(engine: Any, belief: Any, actions: Values, samples: int) -> Tensor:
@@ -111,8 +155,14 @@ def _after(engine: Any, belief: Any, step: Step, known: Values, seen: Values) ->
 def _expected(engine: Any, belief: Any, actions: Values, samples: int, names: tuple[str, ...]) -> Tensor:
     """H(interest) - E H(interest | observation), (rows,)."""
     step, known = _moved(engine, belief, actions)
+    before = _believed(engine, belief, step, known | actions, _blank(engine, len(belief.log_weights), torch.nan), names)
+    after = _ahead(engine, belief, step, known | actions, samples, lambda later: engine.entropy(later, names))
+    return before - after
+
+
+def _ahead(engine: Any, belief: Any, step: Step, given: Values, samples: int, worth: Callable[[Any], Tensor]) -> Tensor:
+    """E[worth(belief after the observation)], (rows,); ``given`` is all that is known after the action."""
     rows, worlds = belief.log_weights.shape
-    before = _believed(engine, belief, step, known | actions, _blank(engine, rows, torch.nan), names)
     found = _all_outcomes(engine)
     seen = found if found is not None else imagined(engine, step, belief.log_weights, samples)
     count = len(next(iter(seen.values()))) if found is not None else samples
@@ -125,12 +175,12 @@ def _expected(engine: Any, belief: Any, actions: Values, samples: int, names: tu
             part = {n: v[some].to(engine.dtype).repeat(rows, *[1] * (v.dim() - 1))[:, None] for n, v in seen.items()}
         else:
             part = {n: v.reshape(rows, samples, *v.shape[2:])[:, some].flatten(0, 1)[:, None] for n, v in seen.items()}
-        context = {n: v[index] for n, v in (known | actions).items()}
+        context = {n: v[index] for n, v in given.items()}
         after = _after(engine, wider, wide, context, part)
-        entropy = engine.entropy(after, names).reshape(rows, len(some))
+        worths = worth(after).reshape(rows, len(some))
         weight = after.log_evidence.exp().reshape(rows, len(some)) if found is not None else 1 / samples
-        total = total + (weight * torch.nan_to_num(entropy)).sum(1)
-    return before - total
+        total = total + (weight * torch.nan_to_num(worths)).sum(1)
+    return total
 
 
 def _all_outcomes(engine: Any) -> Values | None:

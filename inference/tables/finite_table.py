@@ -125,6 +125,14 @@ class FiniteTable(Table):
         at = uniform.expand(len(rows), -1, -1).gather(2, index)
         return drawn.scatter(2, index, _inverse(here, at))
 
+    def divergence(self, rows: Tensor) -> Tensor | None:
+        """Return KL(p(y | h) | p(y | baseline)), nats, (R, H); finite, as a baseline excludes no outcome."""
+        if self.baseline is None or self.index is None:
+            return None
+        ratio, index = self.table[rows], self.index[rows]
+        floor = self.baseline[rows].gather(1, index.flatten(1)[..., None].expand(-1, -1, ratio.shape[-1]))
+        return torch.xlogy((ratio + floor.reshape(ratio.shape)).exp(), ratio.exp()).sum((-2, -1))
+
 
 def _outcome(table: Tensor, y: Tensor) -> Tensor:
     """table (..., C) at outcomes y (...); NaN is missing and scores zero."""

@@ -70,6 +70,23 @@ class GaussianTable(Table):
             location = location.scatter(2, index, twice - location.gather(2, index))
         return location + self.scale[rows][:, None] * noise
 
+    def divergence(self, rows: Tensor) -> Tensor | None:
+        """Return half the squared standardised distance of a hypothesis's means from the baseline's, (R, H)."""
+        if self.index is None:
+            return None
+        apart = self.slope[rows] * _at(self.scale[rows], self.index[rows])
+        return 0.5 * (apart * apart).sum(-1)
+
+    def own(self, rows: Tensor) -> Tensor | None:
+        """Return d' (R, H) where each hypothesis shows in elements that no other one does."""
+        half = self.divergence(rows)
+        if half is None or self.index is None:
+            return None
+        # Elements that do not differ fill up the index: each gets a number of its own, which is none of an element.
+        fill = torch.arange(self.index[0].numel()).reshape(self.index.shape[1:])
+        shown = torch.where(self.slope[rows] != 0, self.index[rows], -1 - fill).flatten(1).sort(1).values
+        return None if bool((shown[:, 1:] == shown[:, :-1]).any()) else (2 * half).sqrt()
+
 
 def _at(values: Tensor, index: Tensor) -> Tensor:
     """values (K, E) at index (K, H, n)."""

@@ -1,7 +1,8 @@
-"""Expected information: what would be seen after an action, and how much surer that would make one (eq. 5.4)."""
+"""Expectations: what would be seen after an action, and what one would believe then (thesis eq. 5.4)."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -12,17 +13,38 @@ from apmodels import ValueOutOfRange
 from apmodels.simulation import Values, as_dict, check_actions
 from inference.tables.table import FEW_OUTCOMES
 
-# How many numbers are held at a time.
-CHUNK = 8_000_000
+# How many numbers are held at a time; more would not stay in a processor's cache, and take twice as long.
+CHUNK = 500_000
+# A function of the interest's log probabilities (N, n), (N,).
+Worth = Callable[[Tensor], Tensor]
 
 
 def information_gain(engine: Any, belief: Any, actions: Any, samples: int, seed: int) -> Tensor:
-    """Return I(interest; next observation | action) under the exact engine, nats, (*batch, K).
+    """Return I(interest; next observation | action) under the exact engine, nats, (*batch, K)."""
 
-    Every pair of a belief and an action is a row. Where the observations of a row have few outcomes, the
-    expectation is a sum over all of them; else an average over imagined ones, drawn with the same random numbers
-    for every action, so that differences between actions are much surer than the gains themselves.
-    """
+    def gain(imagined: Imagination) -> Tensor:
+        # No information is negative; rounding, and few imagined observations, can make it seem so.
+        return (uncertainty(imagined.before()) - imagined.expected(uncertainty, samples, seed)).clamp(min=0)
+
+    return of_pairs(engine, belief, actions, gain, samples)
+
+
+def expectation(engine: Any, belief: Any, worth: Worth, actions: Any, samples: int, seed: int) -> Tensor:
+    """Return E[worth(the next belief about the interest) | action] under the exact engine, (*batch, K)."""
+    return of_pairs(engine, belief, actions, lambda imagined: imagined.expected(worth, samples, seed), samples)
+
+
+def imagine(engine: Any, belief: Any, actions: Values, samples: int, seed: int) -> tuple[Values, Tensor]:
+    """Return observations (B, S, *shape) by name, and how probable each is, (B, S); see ``Engine.imagine``."""
+    imagined = Imagination(engine, belief, torch.arange(len(belief.log_probs)), actions)
+    seen, weights = imagined.seen(samples, seed, samples)
+    return {name: value.reshape(*value.shape[:2], *engine.shown[name]) for name, value in seen.items()}, weights
+
+
+def of_pairs(
+    engine: Any, belief: Any, actions: Any, answer: Callable[[Imagination], Tensor], samples: int = 1
+) -> Tensor:
+    """Return what R rows answer, (R,), for every pair of a belief and an action, (*batch, K); some rows at a time."""
     acts = choices(engine, actions)
     many = len(next(iter(acts.values()))) if acts else 1
     count = len(belief.log_probs)
@@ -30,9 +52,14 @@ def information_gain(engine: Any, belief: Any, actions: Any, samples: int, seed:
     parts = []
     for pairs in torch.arange(count * many).split(step):
         rows, chosen = pairs // many, {name: values[pairs % many] for name, values in acts.items()}
-        parts.append(_Imagination(engine, belief, rows, chosen).gain(samples, seed))
-    gains = torch.cat(parts).reshape(count, many)
-    return gains[0] if belief.batch is None else gains
+        parts.append(answer(Imagination(engine, belief, rows, chosen)))
+    answers = torch.cat(parts).reshape(count, many)
+    return answers[0] if belief.batch is None else answers
+
+
+def uncertainty(logs: Tensor) -> Tensor:
+    """Return the entropy of log probabilities (N, n), nats, (N,)."""
+    return -(logs.exp() * logs.clamp(min=torch.finfo(logs.dtype).min)).sum(-1)
 
 
 def choices(engine: Any, actions: Any) -> Values:
@@ -51,7 +78,7 @@ def choices(engine: Any, actions: Any) -> Values:
     return checked
 
 
-class _Imagination:
+class Imagination:
     """What R beliefs expect after R actions: log p(statics, states before, states now), and the observations."""
 
     def __init__(self, engine: Any, belief: Any, rows: Tensor, actions: Values):
@@ -68,23 +95,32 @@ class _Imagination:
         else:
             self.logs = engine.joint(part.log_probs, self.rows).log()
 
-    def gain(self, samples: int, seed: int) -> Tensor:
-        """Return the expected information of each row, nats, (R,)."""
-        outcomes = {name: table.outcomes for name, table in self.engine.tabulation.tables.items()}
-        few = [len(values) for values in outcomes.values() if values is not None]
-        before = self._entropy(self.logs)
-        if len(few) == len(outcomes) and torch.Size(few).numel() <= FEW_OUTCOMES:
-            after = self._posterior(self._all(outcomes, torch.Size(few)))
-            weights = self._total(after).exp()
-        else:
-            after = self._posterior(self._drawn(samples, seed))
-            weights = torch.full(after.shape[:2], 1.0 / samples, dtype=after.dtype)
+    def before(self) -> Tensor:
+        """Return the interest's log probabilities after the action and before anything is seen, (R, n)."""
+        return self._interest(self.logs)
+
+    def expected(self, worth: Worth, samples: int, seed: int) -> Tensor:
+        """Return the expectation of a function of the interest's log probabilities, over what is seen, (R,).
+
+        Where observations have few outcomes it is a sum over all of them; else an average over imagined ones, drawn
+        with the same random numbers for every action, so that differences between actions are much surer than the
+        expectations themselves.
+        """
+        seen, weights = self.seen(samples, seed, FEW_OUTCOMES)
+        after = self._posterior(seen)
         # An outcome that cannot happen has no posterior, and no weight.
         normalised = after - self._total(after).clamp(min=-1e30).reshape(*after.shape[:2], *[1] * (after.dim() - 2))
-        entropies = self._entropy(normalised.flatten(0, 1)).reshape(weights.shape)
-        gain = before - (weights * torch.where(weights > 0, entropies, 0.0)).sum(1)
-        # No information is negative; rounding, and few imagined observations, can make it seem so.
-        return gain.clamp(min=0)
+        worths = worth(self._interest(normalised.flatten(0, 1))).reshape(weights.shape)
+        return (weights * torch.where(weights > 0, worths, 0.0)).sum(1)
+
+    def seen(self, samples: int, seed: int, few: int) -> tuple[Values, Tensor]:
+        """Return observations (R, S, elements) by name and their weights (R, S): all of them where they are few."""
+        outcomes = {name: table.outcomes for name, table in self.engine.tabulation.tables.items()}
+        counts = [len(values) for values in outcomes.values() if values is not None]
+        if len(counts) == len(outcomes) and torch.Size(counts).numel() <= few:
+            seen = self._all(outcomes, torch.Size(counts))
+            return seen, self._total(self._posterior(seen)).exp()
+        return self._drawn(samples, seed), self.logs.new_full((len(self.rows), samples), 1.0 / samples)
 
     def _all(self, outcomes: dict[str, Tensor], counts: torch.Size) -> Values:
         """Every joint outcome, (R, outcomes, elements) by name."""
@@ -126,7 +162,15 @@ class _Imagination:
     def _total(self, logs: Tensor) -> Tensor:
         return logs.reshape(*logs.shape[:2], -1).logsumexp(2)
 
-    def _entropy(self, logs: Tensor) -> Tensor:
-        """The entropy of the interest now, (N,), from normalised log weights (N, *mesh)."""
+    def other(self, name: str) -> str | None:
+        """Return a hidden variable, other than the interest as it is now, that an observation depends on, if any."""
+        names = self.engine.structure.interest
+        for axis, size in zip(self.engine.layout.step_axes, self.engine.tabulation.shapes[name], strict=True):
+            if size > 1 and (axis.lag or axis.name not in names):
+                return f"prev_{axis.name}" if axis.lag else axis.name
+        return None
+
+    def _interest(self, logs: Tensor) -> Tensor:
+        """The interest's log probabilities now, (N, n), from normalised log weights (N, *mesh)."""
         present = logs.logsumexp(tuple(self.past)) if len(self.past) else logs
-        return self.engine.projections.entropy(self.engine.layout.padded(present), self.engine.names(None))
+        return self.engine.projections.marginal(self.engine.layout.padded(present), self.engine.names(None))[1]

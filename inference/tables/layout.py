@@ -15,7 +15,8 @@ class Layout:
 
     A belief is an array over ``statics`` and ``states``; a step is an array over ``statics``, ``previous`` (the
     states that somebody remembers, a step ago) and ``present`` (the states now). ``keys`` are the contexts: what is
-    known and bears on what is hidden or seen.
+    known and bears on what is hidden or seen. ``spent`` are statics that only say how a state begins, which nobody
+    asks about: they are summed out before the first step.
     """
 
     def __init__(self, laws: Laws, structure: Structure):
@@ -24,7 +25,11 @@ class Layout:
         own = {node.name: len(node.values) for node in structure.hidden if node.values is not None}
         remembered = laws.model.declaration.remembered
         hidden = [node for node in structure.nodes.values() if node.name in values]
-        self.statics = [Axis(n.name, 0, values[n.name]) for n in hidden if n.role == "static"]
+        statics = [Axis(n.name, 0, values[n.name]) for n in hidden if n.role == "static"]
+        bears = {parent.name for variable in laws.variables.values() for parent in variable.parents}
+        self.statics = [axis for axis in statics if axis.name in bears or axis.name in structure.interest]
+        kept = {axis.name for axis in self.statics}
+        self.spent = [axis for axis in statics if axis.name not in kept]
         self.states = [Axis(n.name, 0, values[n.name]) for n in hidden if n.role == "state"]
         self.previous = [Axis(axis.name, 1, axis.values) for axis in self.states if axis.name in remembered]
         # A state never comes back to a value that only its time before the first step had.

@@ -77,6 +77,8 @@ class Projections:
             if node is None:
                 raise ValueOutOfRange(f"there is no variable {name}{nearest(name, hidden)}")
             raise ValueOutOfRange(f"{name} is {node.plan}, and no belief is held about it: see belief.known")
+        if name in {axis.name for axis in self.layout.spent}:
+            raise ValueOutOfRange(f"{name} only says how a state begins, and is forgotten; let it be of interest")
         try:
             return mesh.value(name)
         except KeyError as missing:

@@ -68,6 +68,14 @@ class Table:
         """Draw y (R, S, elements) under hypotheses chosen (R, S) in contexts rows (R,), with common random numbers."""
         raise NotImplementedError
 
+    def divergence(self, rows: Tensor) -> Tensor | None:
+        """Return KL(p(y | h) | p(y | baseline)) in contexts rows (R,), nats, (R, H); None without a common baseline."""
+        return None
+
+    def own(self, rows: Tensor) -> Tensor | None:
+        """Return d' (R, H) in contexts rows (R,) where each hypothesis shows in Normal elements that no other does."""
+        return None
+
     @property
     def outcomes(self) -> Tensor | None:
         """All values of the whole observation (outcomes, elements), where they are few."""

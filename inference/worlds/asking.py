@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from torch import Tensor
 
 from apmodels import ValueOutOfRange
+from apmodels.simulation import Values
 from inference.answers.entropies import entropy
 from inference.answers.forecasts import forecast
-from inference.answers.gain import information_gain
+from inference.answers.gain import expectation, imagine, information_gain
 from inference.answers.posteriors import marginal
 from inference.beliefs import Marginal, Weighted
 from inference.engine import Engine
@@ -39,6 +41,21 @@ class Asking(Engine):
     def gain(self, belief: BankBelief, actions: Any = None, samples: int = 64, seed: int = 0) -> Tensor:
         """Return the expected information about the interest, nats, (*batch, K) (thesis eq. 5.4)."""
         return information_gain(self, belief, actions, samples, seed)
+
+    def expect(
+        self,
+        belief: BankBelief,
+        worth: Callable[[Tensor], Tensor],
+        actions: Any = None,
+        samples: int = 64,
+        seed: int = 0,
+    ) -> Tensor:
+        """Return the expectation of a function of the next belief about the interest, (*batch, K)."""
+        return expectation(self, belief, worth, actions, samples, seed)
+
+    def imagine(self, belief: BankBelief, action: Any, samples: int = 64, seed: int = 0) -> tuple[Values, Tensor]:
+        """Return what may be seen next, (B, S, *shape) by name, and how probable each is, (B, S)."""
+        return imagine(self, belief, self._actions(action, len(belief.log_weights)), samples, seed)
 
     def forecast(self, belief: BankBelief, action: Any) -> Any:
         """Return the predictive distribution of the next observation, a mixture over worlds; a dict of several."""
