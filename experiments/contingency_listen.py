@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
+from yaml import YAMLError
 
 from apmodels import ValueOutOfRange
 from experiments import cli
@@ -52,7 +54,7 @@ def main() -> None:
         options = _options(words)
         result = judge(options, Console(highlight=False))
         if options.folder:
-            for path in result.write(Path(options.folder).expanduser()):
+            for path in result.write(Path(os.path.expanduser(options.folder))):
                 print(f"wrote {path}")
     except InstantiationException as error:
         cli.fail(str(error.__cause__ or error))
@@ -63,6 +65,9 @@ def main() -> None:
 
 
 def _options(words: list[str]) -> DictConfig:
+    for word in words:
+        if "=" not in word:
+            raise ValueOutOfRange(f"'{word}' is no key=value; give listen=FILE.wav calls=FILE.csv")
     given = {key: value for key, _, value in (word.partition("=") for word in words)}
     name = given.pop("model", MODELS[0])
     if name not in MODELS:
@@ -74,15 +79,19 @@ def _options(words: list[str]) -> DictConfig:
     paths = {key: given.pop(key) for key in ("listen", "calls", "folder") if key in given}
     try:
         options = OmegaConf.merge(options, OmegaConf.from_dotlist([f"{key}={value}" for key, value in given.items()]))
+    except YAMLError:
+        said = " ".join(f"{key}={value}" for key, value in given.items())
+        raise ValueOutOfRange(f"{said} cannot be read; is a bracket missing?") from None
     except (OmegaConfBaseException, ValueError) as error:
-        said = str(error).splitlines()[0].replace("Key ", "There is no key ").replace(" is not in struct", "")
+        key = getattr(error, "full_key", None)
+        said = f"there is no key '{key}'" if key else str(error).splitlines()[0]
         raise ValueOutOfRange(f"{said}: apmodels contingency --help lists the keys") from None
     options.update(paths)
     if not options.listen or not options.calls:
         raise ValueOutOfRange("give a recording and the times of its calls: listen=FILE.wav calls=FILE.csv")
     if not isinstance(options.certain, float) or not 0 < options.certain < 1:
         raise ValueOutOfRange(f"certain is a probability between 0 and 1, not {options.certain}")
-    if not isinstance(options.exponent, (int, float)):
+    if isinstance(options.exponent, bool) or not isinstance(options.exponent, (int, float)):
         raise ValueOutOfRange(f"an exponent is a number, not {options.exponent}")
     assert isinstance(options, DictConfig)
     return options
@@ -92,10 +101,13 @@ def judge(options: Any, console: Console) -> Result:
     """Return what a recording says: a summary, every step, and a figure; see ``USAGE`` for the options."""
     sound, rate = read_sound(options.listen)
     model = instantiate(options.model)
-    times, merged = _calls(Path(options.calls).expanduser(), len(sound) / rate, model.period)
+    if model.period * rate < 1:
+        raise ValueOutOfRange(f"a period of {model.period} s is shorter than a sample of the recording")
+    times, merged = _calls(Path(os.path.expanduser(options.calls)), len(sound) / rate, model.period)
     starts, calls = steps(times, len(sound) / rate, model.period)
     size = round(model.period * rate)
-    levels = decibels(np.stack([sound[(at := round(s * rate)) : at + size] for s in starts]))
+    # One at a time: a long recording is not copied, and rounding may leave the last step a sample shorter.
+    levels = np.array([decibels(sound[(at := round(s * rate)) : at + size]) for s in starts])
     threshold = float(TwoMeans(options.exponent).middle(levels))
     heard = levels > threshold
     engine = Exact(model, torch.float64)
@@ -141,14 +153,16 @@ def _calls(path: Path, seconds: float, period: float) -> tuple[np.ndarray, int]:
         rows = [
             row for row in csv.reader(path.read_text(encoding="utf-8-sig").splitlines()) if any(map(str.strip, row))
         ]
-    except UnicodeDecodeError:
+    except (UnicodeDecodeError, csv.Error):
         raise ValueOutOfRange(f"'{path}' is no text; calls= is a CSV of seconds") from None
-    column = 0
+    column, width = 0, None
     if rows and not _is_number(rows[0][0]):
-        names = [name.strip() for name in rows.pop(0)]
-        column = names.index("seconds") if "seconds" in names else 0
+        names = [name.strip().lower() for name in rows.pop(0)]
+        column, width = names.index("seconds") if "seconds" in names else 0, len(names)
     for row in rows:
-        if len(row) <= column or not _is_number(row[column]):
+        # Under a header of one name, '9,5' is nine and a half written with a comma, and not 9.
+        wider = width is not None and any(map(str.strip, row[width:]))
+        if wider or len(row) <= column or not _is_number(row[column]):
             raise ValueOutOfRange(f"'{path}' has a line that is no time in seconds: {','.join(row)!r}")
     times = np.sort(np.array([float(row[column]) for row in rows]))
     inside = times[(times >= 0) & (times + period <= seconds)]

@@ -12,6 +12,7 @@ import numpy as np
 from hydra.utils import instantiate
 from rich.console import Console, Group
 from rich.live import Live
+from rich.padding import Padding
 from rich.progress_bar import ProgressBar
 from rich.text import Text
 
@@ -30,7 +31,8 @@ SHOWN = 60
 def live(config: Any, folder: Path, console: Console) -> Result:
     """Hold a session; see ``conf/experiment/contingency/live.yaml``."""
     steps = 40 if config.quick else config.steps
-    if not 0 <= config.listen < steps or not 0 < config.certain < 1:
+    numbers = all(isinstance(number, (int, float)) for number in (config.listen, config.certain, steps))
+    if not numbers or not 0 <= config.listen < steps or not 0 < config.certain < 1:
         raise ValueOutOfRange(f"live needs a certainty in (0, 1) and more steps than the {config.listen} of listening")
     body = _body(config)
     try:
@@ -71,6 +73,7 @@ def _hold(session: Session, config: Any, steps: int, folder: Path, console: Cons
     """Run the session with the belief in the terminal; return what went wrong, or nothing."""
     console.print(f"sound check: {config.check * session.body.period:.0f} s; please say nothing")
     folder.mkdir(parents=True, exist_ok=True)
+    complaint = ""
     with Live(console=console, auto_refresh=False) as screen, _asked_to_stop() as asked:
         try:
             for row in session.run(steps, config.seed, folder / "session.csv"):
@@ -78,8 +81,11 @@ def _hold(session: Session, config: Any, steps: int, folder: Path, console: Cons
                 if asked or (config.stop and row["probability"] >= config.certain):
                     break
         except SoundError as error:
-            return str(error)
-    return ""
+            complaint = str(error)
+    if not console.is_terminal:
+        # In a file or a pipe the last line of what was shown is not ended.
+        console.print()
+    return complaint
 
 
 @contextmanager
@@ -107,7 +113,8 @@ def _shown(session: Session, certain: float) -> Group:
         Text(f"{last['seconds']:6.1f} s   ▲ call  ● sound  · silence"),
         Text(marks, style="bold"),
         Text(f"P(somebody answers) {chance:6.3f}", style=color),
-        ProgressBar(total=1.0, completed=chance, width=SHOWN, complete_style=color, finished_style=color),
+        # A bar alone does not end its line.
+        Padding(ProgressBar(total=1.0, completed=chance, width=SHOWN, complete_style=color, finished_style=color), 0),
         Text(f"level {last['level']:6.1f} dB, threshold {last['threshold']:6.1f} dB", style="dim"),
     )
 

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 import xarray as xr
 from hydra.utils import instantiate
+from omegaconf import OmegaConf
 from rich.console import Console
 
 from apmodels import ValueOutOfRange
@@ -57,8 +58,11 @@ def room(config: Any, folder: Path, console: Console) -> Result:
 
 
 def _check(config: Any, sessions: int, steps: int, listen: Any) -> None:
-    if sessions < 1 or not 0 < config.certain < 1 or not config.rooms:
+    numbers = all(isinstance(number, (int, float)) for number in (sessions, config.certain, steps, config.glance))
+    if not numbers or sessions < 1 or not 0 < config.certain < 1 or not config.rooms:
         raise ValueOutOfRange("room needs a room, 1 session or more, and a certainty in (0, 1)")
+    if config.glance < 1 or (not OmegaConf.is_list(listen) and not isinstance(listen, list)):
+        raise ValueOutOfRange(f"room needs a list of listenings and a glance of 1 step or more, not {listen}")
     if not listen or not 0 <= min(listen) <= max(listen) <= steps - config.glance:
         raise ValueOutOfRange(
             f"of {steps} steps {config.glance} or more must be left after listening for {list(listen)}"
@@ -80,6 +84,10 @@ class Hall:
         self.engine = Exact(self.model, torch.float64)
         for name in config.rooms:
             # What is wrong with a room is better said before planning than after.
+            if not _is_room(config.rooms[name]):
+                raise ValueOutOfRange(
+                    f"room {name} must be such as {{conversation: -10, lasting: [1.5, 2.5], chance: 1.0}}"
+                )
             self.body(name, True)
         self.plan = DynamicProgramming(self.engine, min(config.horizon, steps), steps=steps)
 
@@ -146,6 +154,14 @@ class Hall:
             f"{name}_seconds": (kinds, self.model.period * (last + 1.0).reshape(one)),
         }
         return xr.Dataset(variables, coords={"answered": [True, False], "time": np.arange(1, self.steps + 1)})
+
+
+def _is_room(chosen: Any) -> bool:
+    if not OmegaConf.is_dict(chosen) or set(chosen) != {"conversation", "lasting", "chance"}:
+        return False
+    numbers = [chosen.chance, *([] if chosen.conversation is None else [chosen.conversation])]
+    both = list(chosen.lasting) if OmegaConf.is_list(chosen.lasting) else []
+    return len(both) == 2 and all(isinstance(number, (int, float)) for number in numbers + both)
 
 
 def _scores(data: xr.Dataset, glance: int) -> dict[str, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -36,7 +37,7 @@ class Session:
         self.controller.reset(seed)
         engine, batch = self.controller.engine, self.body.batch
         belief, judged = engine.start(batch), self.judge.start(batch)
-        with open(path or "/dev/null", "w", newline="", buffering=1) as file:
+        with open(path or os.devnull, "w", newline="", buffering=1) as file:
             table: Any = csv.DictWriter(file, COLUMNS)
             table.writeheader()
             for step in range(1, steps + 1):

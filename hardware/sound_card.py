@@ -45,6 +45,7 @@ class SoundCard:
             )
             self.stream.start()
         except (self.audio.PortAudioError, ValueError) as error:
+            self.close()
             raise SoundError(
                 f"There is no microphone with a loudspeaker that can be used here: {str(error).rstrip('.')}; "
                 f"'python -m sounddevice' lists the devices."

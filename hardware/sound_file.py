@@ -21,12 +21,13 @@ def read_sound(path: str | os.PathLike[str]) -> tuple[np.ndarray, int]:
     """Read a recording.
 
     Returns:
-        (samples,) float32 in [-1, 1], the mean of all channels, or the loudest where they cancel; samples a second.
+        (samples,) float32, the mean of all channels, or the loudest where they cancel; samples a second. Full scale is
+        1; only a recording of floating-point numbers may be beyond it.
 
     Raises:
         SoundError: there is no such file, it is no recording, holds no sound, or is silent all through.
     """
-    path = Path(path).expanduser()
+    path = Path(os.path.expanduser(path))
     if path.is_dir() or not path.exists():
         raise SoundError(
             f"'{path}' is {'a folder' if path.is_dir() else 'not there'}; give a recording, such as a WAV."

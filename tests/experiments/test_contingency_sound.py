@@ -8,6 +8,8 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ import xarray as xr
 
 from experiments import data
 from experiments.contingency_listen import steps
+from experiments.contingency_room import Hall, _area
 from experiments.contingency_session import verdict
 from experiments.sounds import RATE, conversation, utterances
 from hardware.sound import chirp, decibels
@@ -60,6 +63,23 @@ def test_rooms(tmp_path):
     assert again["babble.calls"] == found["babble.calls"]
 
 
+def test_calls_count_until_it_is_certain():
+    made: Any = SimpleNamespace(
+        config=SimpleNamespace(certain=0.9), count=2, steps=4, model=SimpleNamespace(period=0.5)
+    )
+    chance = np.array([[0.1, 0.9, 0.2, 0.1], [0.1, 0.2, 0.3, 0.8], [0.95, 0.1, 0.1, 0.1], [0.1, 0.1, 0.1, 0.99]])
+    calls = np.array([[1, 0, 1, 1], [0, 1, 0, 1], [1, 1, 1, 1], [0, 0, 0, 1]])
+    found = Hall._decided(made, "planned", chance, calls)
+    assert found.planned_known.values.tolist() == [[True, False], [True, True]]
+    assert found.planned_calls.values.tolist() == [[1, 2], [1, 1]]
+    assert found.planned_seconds.values.tolist() == [[1.0, 2.0], [0.5, 2.0]]
+    np.testing.assert_array_equal(found.planned_probability.sel(answered=False, time=4), [0.1, 0.99])
+
+
+def test_the_area_is_how_often_the_answered_session_wins():
+    assert _area(np.array([0.5, 0.9]), np.array([0.5, 0.1])) == pytest.approx((1 + 1 + 1 + 0.5) / 4)
+
+
 @VOICES
 @pytest.mark.parametrize(
     "words",
@@ -67,6 +87,12 @@ def test_rooms(tmp_path):
         ["sessions=0"],
         ["certain=1.2"],
         ["steps=50", "listen=[60]"],
+        ["listen=5"],
+        ["certain=much"],
+        ["glance=0", "listen=[0]"],
+        ["rooms.quiet.lasting=[1]", "quick=true"],
+        ["+rooms.mine={conversation: -5}", "quick=true"],
+        ["rooms.quiet.conversation=loud", "quick=true"],
         ["half=other"],
         ["rooms.quiet.lasting=[500,600]", "quick=true"],
         ["rooms.quiet.chance=2", "quick=true"],
@@ -76,6 +102,22 @@ def test_rooms(tmp_path):
 )
 def test_bad_rooms(tmp_path, words):
     code, _, complaint = apmodels(tmp_path, "experiment=contingency/room", *words)
+    assert code == 2 and one_sentence(complaint)
+
+
+@VOICES
+def test_what_is_shown_has_lines_of_its_own(tmp_path):
+    words = "experiment=contingency/live", "quick=true", "room=quiet", "hydra.run.dir=run"
+    code, said, complaint = apmodels(tmp_path, *words)
+    assert code == 0, complaint
+    lines = said.splitlines()
+    assert any(line.startswith("level ") and "dB, threshold " in line for line in lines)
+    assert any(line.startswith("P(somebody answers) = ") for line in lines)
+
+
+@pytest.mark.parametrize("words", [["certain=much"], ["listen=many"]])
+def test_bad_sessions(tmp_path, words):
+    code, _, complaint = apmodels(tmp_path, "experiment=contingency/live", "quick=true", *words)
     assert code == 2 and one_sentence(complaint)
 
 
@@ -160,6 +202,8 @@ def test_a_recording_is_judged(tmp_path, answered, options):
     found = json.loads((tmp_path / "out/summary.json").read_text())
     assert found["calls"] == calls and found["clipped"] == 0
     assert (found["probability"] > 0.975) if answered else (found["probability"] < 0.1)
+    # The first call is at 10 s.
+    assert (10 < found["seconds_to_certain"] < 30) if answered else found["seconds_to_certain"] is None
     assert ("somebody answers" if answered else "nobody seems to answer") in said
     kept = xr.open_dataset(tmp_path / "out/contingency.nc", engine="h5netcdf")
     assert int(kept.call.sum()) == calls and (kept.sound.values[kept.call.values == 1] == 1).all()
@@ -170,6 +214,8 @@ def test_steps_begin_with_calls():
     starts, calls = steps(np.array([2.0, 3.9, 4.7]), 6.5, 0.8)
     np.testing.assert_allclose(starts, [0.4, 1.2, 2.0, 2.8, 3.9, 4.7, 5.5])
     assert calls.tolist() == [False, False, True, False, True, True, False]
+    # In floating point 0.3 is a little less than 3 times 0.1.
+    assert len(steps(np.array([0.3]), 0.6, 0.1)[0]) == 6
 
 
 def test_what_is_odd_about_a_recording_is_said(tmp_path):
@@ -187,6 +233,28 @@ def test_what_is_odd_about_a_recording_is_said(tmp_path):
     assert "nothing stands out" in said
 
 
+def test_the_column_of_seconds_is_found(tmp_path):
+    calls = recording(tmp_path, True, seconds=30.0)
+    times = (tmp_path / "calls.csv").read_text().split()[1:]
+    (tmp_path / "more.csv").write_text("name, Seconds\n" + "".join(f"{i},{time}\n" for i, time in enumerate(times)))
+    (tmp_path / "less.csv").write_bytes("\ufeffseconds,\r\n".encode() + "".join(f"{t},\r\n" for t in times).encode())
+    (tmp_path / "plain.csv").write_bytes("\ufeff".encode() + "\n".join(times[::-1]).encode())
+    for name in ("more.csv", "less.csv", "plain.csv"):
+        _, said, _ = apmodels(tmp_path, "contingency", "listen=a.wav", f"calls={name}")
+        assert f"{calls} calls" in said and "somebody answers" in said and "came within" not in said
+
+
+def test_the_last_step_may_be_a_sample_short(tmp_path):
+    """A period of 6401.5 samples, and a call as late as there is room for."""
+    rate, period, n = 8000, 6401.5 / 8000, 80001
+    soundfile.write(tmp_path / "a.wav", np.random.default_rng(0).normal(0, 0.1, n), rate)
+    (tmp_path / "calls.csv").write_text(f"{(n - 6401.5) / rate:.10f}\n")
+    code, said, complaint = apmodels(
+        tmp_path, "contingency", "listen=a.wav", "calls=calls.csv", f"model.period={period}"
+    )
+    assert code == 0 and "P(somebody answers)" in said, complaint
+
+
 @pytest.mark.parametrize(
     "words, why",
     [
@@ -197,6 +265,7 @@ def test_what_is_odd_about_a_recording_is_said(tmp_path):
         (["listen=calls.csv", "calls=calls.csv"], "cannot be read"),
         (["listen=a.wav", "calls=a.wav"], "no text"),
         (["listen=a.wav", "calls=late.csv"], "within the recording"),
+        (["listen=a.wav", "calls=last.csv"], "within the recording"),
         (["listen=a.wav", "calls=words.csv"], "no time in seconds"),
         (["listen=a.wav", "calls=nothing.csv"], "names 0 calls"),
         (["listen=a.wav", "calls=calls.csv", "certain=2"], "between 0 and 1"),
@@ -207,13 +276,23 @@ def test_what_is_odd_about_a_recording_is_said(tmp_path):
         (["listen=a.wav", "calls=calls.csv", "model.period=0"], "period"),
         (["listen=a.wav", "calls=calls.csv", "model.period=many"], "period"),
         (["listen=a.wav", "calls=calls.csv", "exponent=loud"], "exponent"),
+        (["listen=a.wav", "calls=calls.csv", "exponent=true"], "exponent"),
+        (["listen=a.wav", "calls=calls.csv", "certain=[1"], "certain"),
+        (["listen=a.wav", "calls=calls.csv", "model.nothing=1"], "'model.nothing'"),
+        (["listen=a.wav", "calls=calls.csv", "model.period=1e-5"], "shorter than a sample"),
+        (["listen=a.wav", "calls=comma.csv"], "no time in seconds"),
+        (["listen=a.wav", "calls=long.csv"], "no text"),
+        (["listen=~nobody/a.wav", "calls=calls.csv"], "not there"),
+        (["a.wav", "calls.csv"], "no key=value"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
 def test_bad_recordings(tmp_path, words, why):
     recording(tmp_path, False, seconds=20.0)
     soundfile.write(tmp_path / "silent.wav", np.zeros(8000), 8000)
-    for name, text in {"late.csv": "3\n99\n", "words.csv": "seconds\n3\nsoon\n", "nothing.csv": "seconds\n"}.items():
+    texts = {"late.csv": "3\n99\n", "words.csv": "seconds\n3\nsoon\n", "nothing.csv": "seconds\n"}
+    texts |= {"last.csv": "3\n19.5\n", "comma.csv": "seconds\n3,5\n9,25\n", "long.csv": "x" * 200_000}
+    for name, text in texts.items():
         (tmp_path / name).write_text(text)
     code, _, complaint = apmodels(tmp_path, "contingency", *words)
     assert code == 2 and one_sentence(complaint) and why in complaint

@@ -30,6 +30,14 @@ def test_levels():
     assert len(chirp(RATE, 0.25)) == 2000
 
 
+def test_a_call_rises_and_fades():
+    call = chirp(RATE, seconds=1.0, low=600.0, high=1800.0)
+    for part, hertz in ((slice(1000), 675.0), (slice(-1000, None), 1725.0)):
+        spectrum = np.abs(np.fft.rfft(call[part]))
+        assert np.argmax(spectrum) * RATE / 1000 == pytest.approx(hertz, abs=75)
+    assert max(decibels(call[:8]), decibels(call[-8:])) < decibels(call) - 20
+
+
 def test_devices_are_devices():
     made = room()
     assert isinstance(made, Microphone) and isinstance(made, Speaker)
@@ -91,8 +99,21 @@ def test_who_does_not_respond_talks_all_the_same():
     loud = np.concatenate([decibels(made.read(800)) > -50 for _ in range(300)])
     # Utterances of 1 s, silences of 3 s in the mean: a quarter of the time; a little more, for two halves of a piece.
     assert 0.2 < loud.mean() < 0.33
+    polite = room(np.full(20, True), noise_level=-90.0, law={"gap": 3.0})
+    assert not (decibels(polite.read(RATE * 5)) > -50).any()
     silent = room(np.full(20, False), noise_level=-90.0)
     assert not (decibels(silent.read(RATE * 5)) > -50).any()
+
+
+def test_rooms_hear_different_things():
+    talk = np.random.default_rng(0).normal(size=RATE * 4)
+    made = room(np.full(9, True), conversation=talk, conversation_level=-31.0, noise_level=-200.0)
+    assert len(np.unique(made.read(8)[:, 0].round(6))) > 1
+    law = {"utterances": [tone(0.3), tone(0.9)], "latency": (0.0, 0.0)}
+    made = room(np.full(40, True), noise_level=-90.0, law=law)
+    made.play(np.zeros(8), np.full(40, True))
+    longer = decibels(made.read(RATE)[:, RATE // 2 :]) > -50
+    assert 5 < longer.sum() < 35
 
 
 def test_nobody_answers_before_the_check_is_over():
@@ -113,6 +134,18 @@ def test_the_same_seed_is_the_same_session():
         return torch.stack([booth.step(np.full(4, t % 4 == 0)) for t in range(40)])
 
     assert session(3).equal(session(3)) and not session(3).equal(session(4))
+
+
+def test_a_session_knows_nothing_of_the_last():
+    booth = SoundBooth(made := room(np.full(4, True)), made)
+    thresholds = []
+    for _ in range(2):
+        booth.reset(5)
+        booth.step(np.zeros(4))
+        thresholds.append(booth.ear.threshold)
+        for _ in range(3):
+            booth.step(np.ones(4))
+    assert thresholds[0].tolist() == thresholds[1].tolist()
 
 
 class Counting:

@@ -15,9 +15,9 @@ class PortAudioError(Exception):
     pass
 
 
-def library(microphone=True, speaker=True, seconds=1e9, pace=1000):
+def library(microphone=True, speaker=True, seconds=1e9, pace=1000, starts=True):
     """A machine with these devices; its microphone gives so many seconds of sound, this many times as fast as life."""
-    played = []
+    played, opened = [], []
 
     class InputStream:
         def __init__(self, samplerate, device, channels, dtype, callback):
@@ -27,12 +27,18 @@ def library(microphone=True, speaker=True, seconds=1e9, pace=1000):
             self.block = samplerate // 50
 
         def start(self):
+            opened.append(self)
+            if not starts:
+                raise PortAudioError("Unanticipated host error")
             threading.Thread(target=self.run, daemon=True).start()
 
         def run(self):
-            rng = np.random.default_rng(0)
+            rng, buffer = np.random.default_rng(0), np.zeros((self.block, 1), np.float32)
             while self.open and self.left > 0:
-                self.callback(rng.normal(0, 0.01, (self.block, 1)).astype(np.float32), self.block, None, None)
+                # As PortAudio does, in the same place again and again.
+                buffer[:] = rng.normal(0, 0.01, (self.block, 1))
+                self.callback(buffer, self.block, None, None)
+                buffer[:] = 1
                 self.left -= self.block
                 time.sleep(1 / 50 / pace)
 
@@ -56,6 +62,7 @@ def library(microphone=True, speaker=True, seconds=1e9, pace=1000):
         play=play,
         stop=lambda: None,
         played=played,
+        opened=opened,
     )
 
 
@@ -81,6 +88,25 @@ def test_a_microphone_that_goes_away_is_noticed(monkeypatch):
         card.read(8000)
 
 
+def test_what_was_not_read_is_forgotten(monkeypatch):
+    monkeypatch.setitem(sys.modules, "sounddevice", library(seconds=1.0))
+    card = SoundCard(rate=8000, patience=0.3)
+    card.read(100)
+    time.sleep(0.3)  # all of it has come
+    card.reset()
+    with pytest.raises(SoundError, match="is it still there"):
+        card.read(1)
+
+
+def test_silence_is_not_played(monkeypatch):
+    fake = library()
+    monkeypatch.setitem(sys.modules, "sounddevice", fake)
+    card = SoundCard(rate=8000)
+    card.play(np.zeros(8), np.array(False))
+    assert not fake.played
+    card.close()
+
+
 def test_a_loudspeaker_that_goes_away_is_noticed(monkeypatch):
     fake = library()
     monkeypatch.setitem(sys.modules, "sounddevice", fake)
@@ -96,6 +122,14 @@ def test_no_devices(monkeypatch, missing):
     monkeypatch.setitem(sys.modules, "sounddevice", library(**missing))
     with pytest.raises(SoundError, match="no microphone with a loudspeaker"):
         SoundCard()
+
+
+def test_a_microphone_that_does_not_start_is_let_go(monkeypatch):
+    fake = library(starts=False)
+    monkeypatch.setitem(sys.modules, "sounddevice", fake)
+    with pytest.raises(SoundError, match="Unanticipated"):
+        SoundCard()
+    assert [stream.open for stream in fake.opened] == [False]
 
 
 def test_no_library(monkeypatch):

@@ -43,9 +43,12 @@ def test_a_file_that_is_cut_short_is_read_as_far_as_it_goes(tmp_path):
     np.testing.assert_allclose(sound, tone(8000)[: len(sound)], atol=1e-3)
 
 
-def test_clipping_is_measured():
+def test_clipping_is_measured(tmp_path):
     assert clipped(np.clip(tone(8000, level=2.0), -1, 1)) == pytest.approx(2 / 3, abs=0.01)
     assert clipped(tone(8000)) == 0
+    # The largest sample of 16 bits is below 1.
+    soundfile.write(tmp_path / "a.wav", np.full(100, 1.0), 8000)
+    assert clipped(read_sound(tmp_path / "a.wav")[0]) == 1
 
 
 def test_a_recording_is_a_microphone(tmp_path):
