@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import textwrap
 import warnings
 from importlib import import_module
 from importlib.resources import files
@@ -67,7 +68,10 @@ def usage() -> str:
     lines += ["", "tools (apmodels NAME --help)"]
     lines += [f"  {name:<22} {about}" for name, (_, about) in TOOLS.items()]
     lines += ["", "groups (GROUP=NAME)"]
-    lines += [f"  {group:<22} {', '.join(choices(group))}" for group in GROUPS]
+    for group in GROUPS:
+        lines += textwrap.wrap(
+            ", ".join(choices(group)), 116, initial_indent=f"  {group:<22} ", subsequent_indent=" " * 25
+        )
     lines += ["", "Every run: seed=N, quick=true, hydra.run.dir=DIR. All of one experiment's keys:"]
     lines += ["  apmodels experiment=NAME --cfg job"]
     return "\n".join(lines)
