@@ -16,7 +16,7 @@ import pytest
 import soundfile
 import xarray as xr
 
-from experiments import data
+from experiments import cli, data
 from experiments.contingency_listen import steps
 from experiments.contingency_room import Hall, _area
 from experiments.contingency_session import verdict
@@ -287,15 +287,20 @@ def test_the_last_step_may_be_a_sample_short(tmp_path):
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
-def test_bad_recordings(tmp_path, words, why):
+def test_bad_recordings(tmp_path, monkeypatch, capsys, words, why):
     recording(tmp_path, False, seconds=20.0)
     soundfile.write(tmp_path / "silent.wav", np.zeros(8000), 8000)
     texts = {"late.csv": "3\n99\n", "words.csv": "seconds\n3\nsoon\n", "nothing.csv": "seconds\n"}
     texts |= {"last.csv": "3\n19.5\n", "comma.csv": "seconds\n3,5\n9,25\n", "long.csv": "x" * 200_000}
     for name, text in texts.items():
         (tmp_path / name).write_text(text)
-    code, _, complaint = apmodels(tmp_path, "contingency", *words)
-    assert code == 2 and one_sentence(complaint) and why in complaint
+    # In this process: to start another takes much longer than to refuse.
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["apmodels", "contingency", *words])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    complaint = capsys.readouterr().err
+    assert ended.value.code == 2 and one_sentence(complaint) and why in complaint
 
 
 def test_help_of_the_tool(tmp_path):
