@@ -71,6 +71,16 @@ def _shape(data: xr.Dataset, name: str) -> dict[str, float]:
     }
 
 
+def _shapes(console: Console, data: xr.Dataset) -> dict[str, float]:
+    """Tell the shape of every model's kernel, and return them all."""
+    summary: dict[str, float] = {}
+    for name in data.model.values.tolist():
+        shape = _shape(data, name)
+        summary |= {f"{name}.{key}": value for key, value in shape.items()}
+        _told(console, name, shape)
+    return summary
+
+
 def _draw(data: xr.Dataset, models: dict[str, Any]) -> Any:
     figure, axes = plt.subplots(2, len(models), figsize=(3.6 * len(models), 6), squeeze=False, layout="constrained")
     for (above, below), (name, model) in zip(axes.T, models.items(), strict=True):
@@ -159,11 +169,7 @@ def acuities(config: Any, folder: Path, console: Console) -> Result:
     if not models:
         raise ValueOutOfRange("acuities needs an eye or more: eyes.NAME={_target_: apmodels.Camera}")
     data = _kernels(config, folder, models)
-    summary: dict[str, float] = {}
-    for name in models:
-        shape = _shape(data, name)
-        summary |= {f"{name}.{key}": value for key, value in shape.items()}
-        _told(console, name, shape)
+    summary = _shapes(console, data)
     return Result(summary, {"acuities": data}, {"acuities": _draw(data, models)})
 
 
@@ -174,11 +180,7 @@ def dynamics(config: Any, folder: Path, console: Console) -> Result:
     for chance in config.restless:
         models[f"restless_{chance:g}"] = WanderingSearch(grid=still.grid, acuity=still.acuity, restless=chance)
     data = _kernels(config, folder, models)
-    summary: dict[str, float] = {}
-    for name in models:
-        shape = _shape(data, name)
-        summary |= {f"{name}.{key}": value for key, value in shape.items()}
-        _told(console, name, shape)
+    summary = _shapes(console, data)
     # The one that wanders least speaks for all: the thesis says that little motion is enough.
     moving = next(name for name in models if name != "still") if len(models) > 1 else None
     summary["moving.peak_at"] = summary[f"{moving}.peak_at"] if moving else np.nan
