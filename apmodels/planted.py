@@ -35,7 +35,7 @@ class Planted(TorchDistribution):
         self.index = torch.as_tensor(index)
         self.here = here
         self.elsewhere = elsewhere
-        batch = elsewhere.batch_shape[:-1]
+        batch = torch.broadcast_shapes(self.index.shape, here.batch_shape, elsewhere.batch_shape[:-1])
         super().__init__(batch, elsewhere.batch_shape[-1:] + elsewhere.event_shape, validate_args=False)
 
     def log_prob(self, value: Tensor) -> Tensor:
@@ -49,15 +49,17 @@ class Planted(TorchDistribution):
 
     def sample(self, sample_shape: torch.Size | tuple = ()) -> Tensor:  # type: ignore[override]
         """Draw values, (*sample_shape, *batch, elements)."""
-        drawn = self.elsewhere.sample(torch.Size(sample_shape))
+        shape = torch.Size(sample_shape)
+        drawn = self.elsewhere.expand(self.batch_shape + self.elsewhere.batch_shape[-1:]).sample(shape)
         index = self.index.unsqueeze(-1).expand(*drawn.shape[:-1], 1)
-        return drawn.scatter(-1, index, self.here.sample(torch.Size(sample_shape)).unsqueeze(-1))
+        return drawn.scatter(-1, index, self.here.expand(self.batch_shape).sample(shape).unsqueeze(-1))
 
     @property
     def mean(self) -> Tensor:
         """The mean of every element, (*batch, elements)."""
-        mean = self.elsewhere.mean
-        return mean.scatter(-1, self.index.unsqueeze(-1), self.here.mean.unsqueeze(-1))
+        mean = self.elsewhere.mean.expand(self.batch_shape + self.event_shape)
+        here = self.here.mean.expand(self.batch_shape).unsqueeze(-1)
+        return mean.scatter(-1, self.index.expand(self.batch_shape).unsqueeze(-1), here)
 
 
 def elementwise_log_prob(law: Distribution, value: Tensor) -> Tensor:

@@ -11,7 +11,8 @@ from torch.distributions import Categorical, Distribution, constraints
 from apmodels.distributions import base_of
 from apmodels.evidence import Evidence
 
-LARGEST_SUPPORT = 4096
+# A photograph's worth of places, 128 x 128; more values than these are sampled.
+LARGEST_SUPPORT = 1 << 14
 
 
 def limits_of(law: Any) -> Any:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import torch
 from pyro.distributions import Categorical, Normal
 
 from apmodels.acuity import Acuity, Calibrated
 from apmodels.model import Model
+from apmodels.planted import Planted
 from apmodels.spaces import Grid
 from apmodels.variables import action, observation, static
 
@@ -27,6 +29,6 @@ class VisualSearch(Model):
     def glimpse(self, target, fixation):
         """One number a cell: standard normal noise, plus d' of the eccentricity where the target is."""
         signal = self.acuity(self.grid.distance(target, fixation))
-        return Normal(signal * self.grid.one_hot(target), 1.0).to_event(1)
+        return Planted(target, Normal(signal, 1.0), Normal(torch.zeros(self.grid.size), 1.0))
 
     interest = target

@@ -30,6 +30,9 @@ from inference.tables.table import Rows
 from inference.tables.tabulation import Tabulation
 from inference.worlds.known import Known
 
+# So many numbers of a batch are weighed at a time; more would not stay in a processor's cache, and take longer.
+CHUNK = 1 << 18
+
 
 class Exact(Engine):
     """Enumerates the hidden values: exact beliefs for models in which all that is hidden is finite.
@@ -102,6 +105,22 @@ class Exact(Engine):
         seen = self._observations(observation, count)
         known, context = self.know(belief, actions)
         rows = self.tabulation.rows(context, count)
+        step = max(1, CHUNK // belief.log_probs[0].numel())
+        if count <= step:
+            log_probs, evidence = self._weighed(belief.log_probs, rows, seen)
+        else:
+            spans = [slice(first, first + step) for first in range(0, count, step)]
+            # Of more than one belief the rows are a tensor, and no slice.
+            each = torch.as_tensor(rows)
+            pieces = [self._weighed(belief.log_probs[s], each[s], {n: y[s] for n, y in seen.items()}) for s in spans]
+            log_probs, evidence = map(torch.cat, zip(*pieces, strict=True))
+        evidence = belief.log_evidence + (evidence[0] if belief.batch is None else evidence)
+        kept = self.known.keep(known | actions, seen) if self.known.kept else {}
+        return FiniteBelief(self, belief.batch, belief.time + 1, evidence, kept, log_probs)
+
+    def _weighed(self, before: Tensor, rows: Rows, seen: Values) -> tuple[Tensor, Tensor]:
+        """Log probabilities (B, *sizes) after what was seen (B, elements) in contexts rows, and log evidence (B,)."""
+        count = len(before)
         evidence: Tensor | float | None = None
         early: list[Tensor] = []
         late: list[Tensor] = []
@@ -113,7 +132,7 @@ class Exact(Engine):
                 late.append(_shaped(ratio, self.tabulation.now_shapes[name]))
             else:
                 early.append(_shaped(ratio, self.tabulation.shapes[name]))
-        log_probs, shift = self.predict(belief.log_probs, rows, early)
+        log_probs, shift = self.predict(before, rows, early)
         weights = sum(late, start=log_probs)
         weights = weights if weights.dim() == 2 else weights.reshape(count, -1)
         log_probs = weights.log_softmax(1)
@@ -123,9 +142,7 @@ class Exact(Engine):
             raise ValueOutOfRange(f"{type(self.model).__name__} gives what was observed no probability at all")
         log_probs = self.layout.padded(_shaped(log_probs, self.layout.present_sizes))
         evidence = total + evidence if shift is None else total + evidence + shift  # type: ignore[operator]
-        evidence = belief.log_evidence + (evidence[0] if belief.batch is None else evidence)
-        kept = self.known.keep(known | actions, seen) if self.known.kept else {}
-        return FiniteBelief(self, belief.batch, belief.time + 1, evidence, kept, log_probs)
+        return log_probs, evidence
 
     def along(self, record: Record, batch: int | None) -> Sequence[FiniteBelief]:
         """Return the beliefs along a record, of many steps at once where nothing stands against it."""

@@ -9,15 +9,20 @@ from torch import Tensor
 
 from inference.tables.slices import Context, Key
 
-# Beyond so many contexts the known values are as good as a continuum, and the table starts again.
-MOST = 1 << 16
+# Beyond so many contexts the known values are as good as a continuum, and the table starts again; and beyond so many
+# numbers, contexts by hypotheses.
+MOST, NUMBERS = 1 << 16, 1 << 28
 
 
 class Contexts:
-    """Rows of a table by context; rows that are missing are made by ``build`` when they are first asked for."""
+    """Rows of a table by context; rows that are missing are made by ``build`` when they are first asked for.
 
-    def __init__(self, keys: list[Key], build: Callable[[Context | None], None], forget: Callable[[], None]):
+    ``size`` is how many hypotheses each row has.
+    """
+
+    def __init__(self, keys: list[Key], size: int, build: Callable[[Context | None], None], forget: Callable[[], None]):
         self.keys = keys
+        self.most = max(1, min(MOST, NUMBERS // size))
         self.build = build
         self.forget = forget
         self.clear()
@@ -52,7 +57,7 @@ class Contexts:
     def _by_number(self, values: Tensor, context: Context) -> Tensor:
         """One whole number, which every grid and every finite action is: a table look-up."""
         low, high = torch.aminmax(values)
-        if low < 0 or high >= MOST:
+        if low < 0 or high >= self.most:
             return self._by_value(context)
         if high >= len(self.lookup):
             self.lookup = torch.nn.functional.pad(self.lookup, (0, int(high) + 1 - len(self.lookup)), value=-1)
@@ -70,7 +75,7 @@ class Contexts:
         table, inverse = torch.unique(torch.cat(columns, 1), dim=0, return_inverse=True)
         first = torch.zeros(len(table), dtype=torch.int64).scatter(0, inverse, torch.arange(len(inverse)))
         keys = [tuple(row) for row in table.tolist()]
-        if len(self.seen) + len(keys) > MOST:
+        if len(self.seen) + len(keys) > self.most:
             self.clear()
         new = [i for i, key in enumerate(keys) if key not in self.seen]
         if new:

@@ -10,6 +10,7 @@ no common baseline the latter is zero.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -59,23 +60,22 @@ def _of_level(law: Any, contexts: int, hypotheses: int, level: int) -> Table | N
 Parts = tuple[Tensor | None, list[Tensor], list[Tensor] | None]
 
 
-def _family_parameters(base: Any) -> list[Tensor]:
+def _family_parameters(base: Any, keep: Callable[[Tensor], Tensor] = lambda p: p) -> list[Tensor]:
     """Parameters of one element, each with all batch dimensions and one more for the parameter's own."""
     if type(base).__name__ == "Normal":
-        return [base.loc[..., None], base.scale[..., None]]
-    if type(base).__name__ == "Bernoulli":
-        return [torch.stack([1 - base.probs, base.probs], -1)]
-    return [base.probs]
+        return [keep(base.loc)[..., None], keep(base.scale)[..., None]]
+    probs = keep(base.probs)
+    return [torch.stack([1 - probs, probs], -1)] if type(base).__name__ == "Bernoulli" else [probs]
 
 
 def _planted(law: Planted) -> Parts | None:
     """Index (K, H, 1), parameters there (K, H, 1, P), and elsewhere (K, E, P)."""
     here = [p.unsqueeze(2) for p in _family_parameters(law.here)]
-    elsewhere = [compact(p) for p in _family_parameters(law.elsewhere)]
+    elsewhere = _family_parameters(law.elsewhere, compact)
     # What is planted does not change what is elsewhere; if it does, the law is as good as dense.
     if any(p.shape[1] != 1 for p in elsewhere):
         return None
-    shape = (len(law.index), elsewhere[0].shape[2])
+    shape = (len(law.index), law.event_shape[0])
     return law.index[..., None], here, [p[:, 0].expand(*shape, p.shape[-1]) for p in elsewhere]
 
 

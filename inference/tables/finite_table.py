@@ -6,13 +6,16 @@ import torch
 from torch import Tensor
 
 from apmodels import ValueOutOfRange
-from inference.tables.table import FEW_OUTCOMES, Rows, Table, generator, summed
+from inference.tables.table import FEW_OUTCOMES, Rows, Table, alike, generator, of_rows, summed
 
 
 class FiniteTable(Table):
     """Elements with finitely many outcomes: log ratios by outcome, gathered (thesis eqs 5.22 and 5.23)."""
 
     stacked = ("index", "table", "baseline")
+
+    # Scores as lines (first, step) of the outcome, of hypotheses and of the baseline, where there are two outcomes.
+    affine: tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]] | None = None
 
     def __init__(self, index: Tensor | None, table: Tensor, baseline: Tensor | None):
         self.index, self.table, self.baseline = index, table, baseline
@@ -39,7 +42,7 @@ class FiniteTable(Table):
                 return self._looked_up(rows, y)
             table = self.table[rows]
             return _outcome(table, y[:, None].expand(table.shape[:-1])).sum(-1)
-        return summed(_outcome(self.flat_table[rows], y.gather(1, self.flat_index[rows])), self.hypotheses)
+        return summed(_chosen(self.flat_table, rows, self.shown(rows, y)), self.hypotheses)
 
     def _looked_up(self, rows: Tensor, y: Tensor) -> Tensor:
         """The same of a batch: only the outcomes that were seen are read, not the table of every one of it."""
@@ -53,39 +56,33 @@ class FiniteTable(Table):
         return torch.nn.functional.embedding_bag(cells, self.by_outcome, mode="sum", padding_idx=nothing)
 
     def settle(self) -> None:
-        """Lay out a sparse table's elements, and after them the baseline's, so that one gather scores both."""
+        """Lay out a dense table by outcome, and one of two outcomes as what is affine in the outcome."""
         super().settle()
         if self.index is None:
             by_outcome = self.table.permute(0, 2, 3, 1).flatten(0, 2)
             # And a last row, for what is missing.
             self.by_outcome = torch.cat([by_outcome, torch.zeros_like(by_outcome[:1])])
-        if self.baseline is not None:
-            elements = torch.arange(self.baseline.shape[1]).expand(len(self.baseline), -1)
-            self.both_index = torch.cat([self.flat_index, elements], 1)
-            self.both_table = torch.cat([self.flat_table, self.baseline], 1)
+        self.affine = None
+        if self.baseline is not None and self.table.shape[-1] == 2 and bool(torch.isfinite(self.table).all()):
+            self.affine = _line(self.flat_table), _line(self.baseline)
 
     def score(self, rows: Rows, y: Tensor) -> tuple[Tensor, Tensor | float]:
         """Return ``ratio`` and ``base``."""
-        if self.baseline is None:
+        if self.affine is None or self.baseline is None:
             return super().score(rows, y)
-        at = y.gather(1, self.both_index[rows])
-        if isinstance(rows, slice):
-            scores = _outcome(self.both_table[rows], at)
-        else:
-            # Only the outcomes that were seen are read, not the table of every one of the batch.
-            cells = rows[:, None], torch.arange(at.shape[1])
-            missing = torch.isnan(at) if at.is_floating_point() else None
-            at = at if missing is None else torch.where(missing, 0.0, at).long()
-            scores = self.both_table[*cells, at]
-            scores = scores if missing is None else torch.where(missing, 0.0, scores)
-        ratio, base = scores.split([self.flat_index.shape[1], y.shape[1]], 1)
+        y = y.to(self.table.dtype)
+        ratio, base = (
+            # What is missing scores nothing.
+            (of_rows(first, rows) + of_rows(step, rows) * seen).nan_to_num(0.0)
+            for (first, step), seen in zip(self.affine, (self.shown(rows, y), y), strict=True)
+        )
         return summed(ratio, self.hypotheses), base.sum(1)
 
     def read(self, y: Tensor, name: str) -> Tensor:
         """Return outcomes (B, elements) as int64, or as they are if some are missing."""
         last = self.table.shape[-1] - 1
         if torch.equal(y.trunc().clamp_(0, last), y):
-            return y.long()
+            return y if self.affine is not None else y.long()
         wrong = ~(torch.isnan(y) | (y >= 0) & (y <= last) & (y == y.round()))
         if bool(wrong.any()):
             value = y[wrong][0].item()
@@ -105,7 +102,7 @@ class FiniteTable(Table):
         """Return log p(y | baseline), (B,)."""
         if self.baseline is None:
             return 0.0
-        return _outcome(self.baseline[rows], y).sum(-1)
+        return _chosen(self.baseline, rows, y).sum(-1)
 
     def sample(self, rows: Tensor, chosen: Tensor, seed: int) -> Tensor:
         """Draw y (R, S, elements), with common random numbers."""
@@ -132,6 +129,27 @@ class FiniteTable(Table):
         ratio, index = self.table[rows], self.index[rows]
         floor = self.baseline[rows].gather(1, index.flatten(1)[..., None].expand(-1, -1, ratio.shape[-1]))
         return torch.xlogy((ratio + floor.reshape(ratio.shape)).exp(), ratio.exp()).sum((-2, -1))
+
+
+def _line(table: Tensor) -> tuple[Tensor, Tensor]:
+    """Scores (K, E) of outcome 0, and how much more those of outcome 1 are."""
+    once = table[:1] if alike(table) else table
+    first = once[..., 0].contiguous()
+    step = once[..., 1] - first
+    return first.expand(table.shape[:-1]), step.expand(table.shape[:-1])
+
+
+def _chosen(table: Tensor, rows: Rows, y: Tensor) -> Tensor:
+    """Scores (B, E) of outcomes y (B, E) in a table (K, E, C); only those that were seen are read."""
+    if isinstance(rows, slice):
+        return _outcome(of_rows(table, rows).expand(*y.shape, -1), y)
+    elements, outcomes = table.shape[1:]
+    first = torch.arange(elements) * outcomes
+    cells, values = (first, table[0]) if alike(table) else (rows[:, None] * (elements * outcomes) + first, table)
+    if not y.is_floating_point():
+        return values.take(cells + y)
+    missing = torch.isnan(y)
+    return torch.where(missing, 0.0, values.take(cells + torch.where(missing, 0.0, y).long()))
 
 
 def _outcome(table: Tensor, y: Tensor) -> Tensor:

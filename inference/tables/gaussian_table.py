@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from inference.tables.table import Rows, Table, generator, summed
+from inference.tables.table import Rows, Table, generator, of_rows, summed
 
 
 class GaussianTable(Table):
@@ -46,14 +46,13 @@ class GaussianTable(Table):
             here = (~missing).to(y.dtype)
             linear = torch.einsum("be,bhe->bh", torch.where(missing, 0.0, residual), slope)
             return linear - torch.einsum("be,bhe->bh", here, slope * offset)
-        at = y.gather(1, self.flat_index[rows])
-        scores = (at - self.flat_middle[rows]) * self.flat_slope[rows]
+        scores = (self.shown(rows, y) - of_rows(self.flat_middle, rows)) * of_rows(self.flat_slope, rows)
         return summed(scores.nan_to_num(0.0, torch.inf, -torch.inf), self.hypotheses)
 
     def base(self, rows: Rows, y: Tensor) -> Tensor:
         """Return log p(y | baseline), (B,)."""
-        scale = self.scale[rows]
-        standardised = (y - self.location[rows]) / scale
+        scale = of_rows(self.scale, rows)
+        standardised = (y - of_rows(self.location, rows)) / scale
         scores = -0.5 * standardised * standardised - scale.log() - 0.9189385332046727
         return scores.nan_to_num(0.0, torch.inf, -torch.inf).sum(-1)
 

@@ -31,6 +31,8 @@ class Table:
     flat_table: Tensor
     flat_slope: Tensor
     flat_middle: Tensor
+    # Hypotheses show in one element each, in order.
+    in_order: bool = False
 
     def append(self, other: Table) -> None:
         """Add the contexts of another table of the same observation; Misfit if they are not of one kind."""
@@ -40,7 +42,9 @@ class Table:
             old, new = getattr(self, name), getattr(other, name)
             if old.shape[1:] != new.shape[1:]:
                 raise Misfit
-            setattr(self, name, torch.cat([old, new]))
+            same = alike(old) and alike(new) and torch.equal(old[:1], new[:1])
+            both = old[:1].expand(len(old) + len(new), *old.shape[1:]) if same else torch.cat([old, new])
+            setattr(self, name, both)
 
     def read(self, y: Tensor, name: str) -> Tensor:
         """Return y (B, elements) as the other methods want it; ValueOutOfRange where it cannot have been seen.
@@ -87,6 +91,24 @@ class Table:
             for name in ("index", "slope", "middle", "table"):
                 if hasattr(self, name):
                     setattr(self, f"flat_{name}", getattr(self, name).flatten(1, 2))
+            first = self.flat_index[0]
+            self.in_order = alike(self.flat_index) and torch.equal(first, torch.arange(self.event_shape.numel()))
+
+    def shown(self, rows: Rows, y: Tensor) -> Tensor:
+        """Return the elements of y (B, elements) in which hypotheses show, (B, H * n)."""
+        if self.in_order:
+            return y
+        return y.gather(1, of_rows(self.flat_index, rows).expand(len(y), -1))
+
+
+def alike(values: Tensor) -> bool:
+    """Whether values (K, ...) are one and the same in all contexts, and kept once."""
+    return len(values) == 1 or values.stride(0) == 0
+
+
+def of_rows(values: Tensor, rows: Rows) -> Tensor:
+    """Return values (K, ...) of contexts, (B, ...); (1, ...), of which nothing is copied, where they are all alike."""
+    return values[:1] if alike(values) else values[rows]
 
 
 def summed(scores: Tensor, hypotheses: int) -> Tensor:

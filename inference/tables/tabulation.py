@@ -7,7 +7,7 @@ from torch import Tensor
 
 from apmodels.distributions import tensors, with_tensors
 from apmodels.laws import Laws
-from apmodels.progress import tracked
+from apmodels.progress import progress
 from inference.tables.contexts import Contexts
 from inference.tables.families import tabulate
 from inference.tables.layout import Layout
@@ -31,7 +31,7 @@ class Tabulation:
         self.layout = layout
         self.names: list[str] = laws.model.observation_names
         self.level = 0
-        self.contexts = Contexts(layout.keys, self._tabulate, self._forget)
+        self.contexts = Contexts(layout.keys, torch.Size(layout.sizes).numel(), self._tabulate, self._forget)
 
     def rows(self, context: Context, count: int) -> Rows:
         """Return the rows of a batch's contexts; a view for a single one, which copies nothing and wakes no threads."""
@@ -70,15 +70,22 @@ class Tabulation:
         """Add the tables of K new contexts, a chunk at a time."""
         count = 1 if context is None else len(next(iter(context.values())))
         nodes = self.laws.model.structure.nodes
-        largest = max(torch.Size(nodes[name].shape).numel() for name in self.names)
-        step = max(1, CHUNK // max(1, largest * torch.Size(self.layout.sizes).numel()))
-        starts = range(0, count, step)
-        for start in tracked(starts, "tabulating") if len(starts) > 3 else starts:
-            part = {key: value[start : start + step] for key, value in (context or {}).items()}
-            mesh = Slice(self.laws, self.layout.step_axes, part)
-            self._append_transitions(mesh)
-            for name in self.names:
-                self._append_observation(mesh, name)
+        shape = max(torch.Size(nodes[name].shape).numel() for name in self.names)
+        # What a context needs is known when one has been evaluated; before, the most that it may need.
+        needs, done = max(1, shape * torch.Size(self.layout.sizes).numel()), 0
+        with progress(show=CHUNK // needs < count // 3) as bar:
+            task = bar.add_task("tabulating", total=count)
+            while done < count:
+                step = max(1, CHUNK // needs)
+                mesh = Slice(
+                    self.laws,
+                    self.layout.step_axes,
+                    {key: value[done : done + step] for key, value in (context or {}).items()},
+                )
+                self._append_transitions(mesh)
+                needs = max(1, *(self._append_observation(mesh, name) for name in self.names))
+                done += step
+                bar.update(task, completed=done)
 
     def _append_transitions(self, mesh: Slice) -> None:
         for i, axis in enumerate(self.layout.present):
@@ -90,8 +97,10 @@ class Tabulation:
             elif self.layout.varies(axis.name):
                 self._transitions[i] = torch.cat([self._transitions[i], new])
 
-    def _append_observation(self, mesh: Slice, name: str) -> None:
+    def _append_observation(self, mesh: Slice, name: str) -> int:
+        """Add an observation's tables of a mesh's contexts, and return how many numbers its law holds for each."""
         law = mesh.distribution(name)
+        held = max(p.untyped_storage().nbytes() // p.element_size() for p in tensors(law))
         shape = tuple(law.batch_shape[1 : 1 + len(mesh.axes)])
         flat, contexts = torch.Size(shape).numel(), mesh.contexts
         parts = [p.expand(contexts, *p.shape[1:]) for p in tensors(law)]
@@ -105,3 +114,4 @@ class Tabulation:
             if all(n == 1 for n in self.layout.past(shape)):
                 self.late.add(name)
         self.tables[name].settle()
+        return max(held // contexts, flat)

@@ -167,8 +167,8 @@ def test_a_state_that_begins_with_a_secret_is_a_secret():
         (OneHotCategorical(ones(2)), [[1.0, 0.0], [0.0, 1.0]]),
         (Bernoulli(0.5 * ones(2)).to_event(1), [[0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]]),
         (Categorical(ones(1, 2)).to_event(1), [[0], [1]]),
-        (Bernoulli(0.5 * ones(12)).to_event(1), 4096),
-        (Bernoulli(0.5 * ones(13)).to_event(1), None),
+        (Bernoulli(0.5 * ones(14)).to_event(1), 1 << 14),
+        (Bernoulli(0.5 * ones(15)).to_event(1), None),
         (Normal(0.0, 1.0), None),
         (Poisson(torch.tensor(1.0)), None),
         (torch.tensor(1.0), None),
@@ -189,7 +189,7 @@ def test_support(law, values):
 
 
 def test_what_is_finite_but_too_large_to_list_is_sampled():
-    assert kind_of(lambda x: Normal(x, 1.0).to_event(1), lambda: Bernoulli(0.5 * ones(13)).to_event(1))[1] == "sampled"
+    assert kind_of(lambda x: Normal(x, 1.0).to_event(1), lambda: Bernoulli(0.5 * ones(15)).to_event(1))[1] == "sampled"
 
 
 @st.composite
