@@ -10,6 +10,7 @@ from apmodels.acuity import Camera as Camera
 from apmodels.acuity import Exponential as Exponential
 from apmodels.acuity import Human as Human
 from apmodels.acuity import HumanContrast as HumanContrast
+from apmodels.blinding_search import BlindingSearch as BlindingSearch
 from apmodels.contingency import Contingency as Contingency
 from apmodels.detector_search import CountModel as CountModel
 from apmodels.detector_search import DetectorSearch as DetectorSearch

@@ -3,30 +3,13 @@
 import numpy as np
 import pytest
 import torch
-from pyro.distributions import Normal
 
-from apmodels import Calibrated, Contingency, Grid, ValueOutOfRange, VisualSearch, observation, state
-from apmodels.transforms import where
+from apmodels import BlindingSearch, Calibrated, Contingency, Grid, ValueOutOfRange, VisualSearch
 from controllers import GreedyInfomax, TreeSearch, rollout
 from hardware import Simulated
 from inference import Exact, Refusal, Variational
 from inference.rows import rows, stacked, taken
 from tests.models import Caller, Coupled, Dial, Door, Lamp, Twins
-
-
-class Blinding(VisualSearch):
-    """Visual search in which a saccade blinds: nothing is seen in its step, nor in the next."""
-
-    @state
-    def blind(self, fixation, prev_fixation=0, prev_blind=0):
-        """Steps without sight, this one included."""
-        return where(fixation != prev_fixation, 2, (prev_blind - 1).clamp(min=0))
-
-    @observation
-    def glimpse(self, target, fixation, blind):
-        """What is seen with open eyes."""
-        signal = self.acuity(self.grid.distance(target, fixation)) * (blind == 0)
-        return Normal(signal * self.grid.one_hot(target), 1.0).to_event(1)
 
 
 def exhaustive(engine, belief, counted, worth):
@@ -183,7 +166,7 @@ def significance(difference):
 
 def test_it_accepts_being_blind_for_what_it_will_see():
     """Greedy looking never moves, as a saccade shows nothing at once."""
-    model = Blinding(grid=Grid(1, 4), acuity=Calibrated(width=1.0))
+    model = BlindingSearch(grid=Grid(1, 4), acuity=Calibrated(width=1.0))
     difference = compared(model, 10, 24, horizon=4, simulations=4, branches=8, samples=32)
     assert significance(difference[:, -1]) > 3
 
@@ -191,7 +174,7 @@ def test_it_accepts_being_blind_for_what_it_will_see():
 @pytest.mark.slow
 def test_on_a_grid_too():
     difference = compared(
-        Blinding(grid=Grid(3, 3), acuity=Calibrated(width=1.2)), 10, 60, horizon=4, simulations=8, samples=32
+        BlindingSearch(grid=Grid(3, 3), acuity=Calibrated(width=1.2)), 10, 60, horizon=4, simulations=8, samples=32
     )
     assert significance(difference.mean(1)) > 3 and significance(difference[:, -1]) > 3
 
