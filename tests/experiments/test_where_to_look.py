@@ -112,3 +112,17 @@ def test_one_search(tmp_path):
 def test_bad_tables(tmp_path, words):
     code, _, complaint = apmodels(tmp_path, "experiment=where_to_look/table_5_1", *words)
     assert code == 2 and one_sentence(complaint)
+
+
+def test_looking_ahead(tmp_path):
+    worlds = "~worlds.larger", "~worlds.wandering", "~worlds.contingency", "worlds.still.steps=2"
+    code, said, complaint = apmodels(
+        tmp_path, "experiment=where_to_look/looking_ahead", "hydra.run.dir=run", "quick=true", *worlds
+    )
+    assert code == 0, complaint
+    found = json.loads((tmp_path / "run/summary.json").read_text())
+    assert "blinding" in said and found["blinding.gain"] > 0 and found["still.ms"] > 0
+    data = xr.open_dataset(tmp_path / "run/blinding.nc", engine="h5netcdf")
+    assert data.sizes == {"controller": 2, "episode": 8, "time": 10}
+    code, _, complaint = apmodels(tmp_path, "experiment=where_to_look/looking_ahead", "worlds.still.episodes=1")
+    assert code == 2 and one_sentence(complaint)
