@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import torch
+from pyro.distributions import Normal
 
-from apmodels import DetectorSearch, Grid, VisualSearch
+from apmodels import DetectorSearch, Grid, VisualSearch, observation
 from benchmarks.timing import milliseconds
 from controllers import GreedyInfomax, MostProbable
 from inference import Exact
 from inference.tables import families
 
 SIDES = (7, 11, 21, 31, 51)
+
+
+class OneHot(VisualSearch):
+    """The same law, written with N means for each of N targets."""
+
+    @observation
+    def glimpse(self, target, fixation):
+        signal = self.acuity(self.grid.distance(target, fixation))
+        return Normal(signal * self.grid.one_hot(target), 1.0).to_event(1)
 
 
 def measure() -> dict[str, float]:
@@ -34,7 +44,7 @@ def _dense(model) -> Exact:
 
 
 def _sparse_against_dense(side: int) -> dict[str, float]:
-    model = VisualSearch(grid=Grid(side, side))
+    model = OneHot(grid=Grid(side, side))
     sparse, dense = Exact(model), _dense(model)
     glimpse = model.simulate(1, actions=torch.zeros(1, dtype=torch.int64), seed=side)["glimpse"][0]
     slim, full = (engine.update(engine.start(), 0, glimpse).marginal("target").probs for engine in (sparse, dense))
