@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
-from itertools import cycle
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import torch
 import xarray as xr
 from hydra.utils import instantiate
-from pyro.distributions.torch import Bernoulli  # type: ignore[attr-defined]
 from rich.console import Console
 from scipy.special import entr
 
-from apmodels import Contingency, ValueOutOfRange, observation, state, static
+from apmodels import ValueOutOfRange
 from apmodels.progress import tracked
-from apmodels.transforms import where
 from controllers import Controller, DynamicProgramming, Playback, rollout
+from experiments.contingency_misspecified_figure import draw
+from experiments.contingency_worlds import TRUTHS, World, worlds_of
 from experiments.study import Result, remembered
 from hardware import Simulated
 from inference import Engine, Exact
@@ -28,130 +26,11 @@ from inference import Engine, Exact
 # A quick look: steps of a session, steps ahead, sessions.
 QUICK = (36, 12, 100)
 BITS = np.log(2)
-TRUTHS = ("nobody", "somebody")
-BURSTY = ("bursty", "answered_bursty")
 # The worlds' rates: as given, or drawn from the agent's own prior.
 RATES = ("fixed", "drawn")
 SHARES = ("right", "wrong", "undecided", "mistaken", "misled", "silent", "in_the_sand")
-MARKS = ("C0o", "C4s", "C2D", "C3*", "C1<", "C1>", "C5^", "C6v")
 MEASURES = ("truth", *SHARES, "calls", "late_calls", "entropy", "surprise")
 BRIEFLY = ("mistaken", "in_the_sand", "calls", "surprise")
-
-# The worlds. Who answers late is a Contingency with another window, and an echo one with a longer echo.
-
-
-class Twice(Contingency):
-    """Whoever answers does so a second time, as often as the first.
-
-    Args:
-        again: first and last step after a call in which the second answer may come; after the window.
-    """
-
-    again: tuple[int, int] = (5, 7)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.window[1] < self.again[0] <= self.again[1]:
-            raise ValueOutOfRange(f"the second answer must come after step {self.window[1]}, not in {self.again}")
-
-    @state
-    def timer(self, vocalize, prev_timer=lambda self: self.again[1] + 1):
-        """Steps since the last call, up to the first in which no second answer can come any more."""
-        return where(vocalize == 1, 0, (prev_timer + 1).clamp(max=self.again[1] + 1))
-
-    @observation
-    def sound(self, responsive, rates, timer):
-        """Whether there was a sound."""
-        again = (self.again[0] <= timer) & (timer <= self.again[1])
-        return super().sound(responsive, rates, where(again, self.window[0], timer))
-
-
-class Chatterbox(Contingency):
-    """Whoever answers does so to every sound: to calls, to the background and to what they said themselves."""
-
-    @state
-    def since(self, prev_sound: Any = 0.0, prev_since=lambda self: self.window[1] + 1):
-        """Steps since the last sound, up to the first in which no answer to it can come any more."""
-        return where(prev_sound == 1, 1, (prev_since + 1).clamp(max=self.window[1] + 1))
-
-    @observation
-    def sound(self, responsive, rates, timer, since):
-        """Whether there was a sound; the robot's echo covers the rest, as in the model."""
-        answering = (timer > self.echo[1]) & (self.window[0] <= since) & (since <= self.window[1])
-        return super().sound(responsive, rates, where(answering, self.window[0], timer))
-
-
-class Bursty(Contingency):
-    """The background is a Markov chain of the same rate: bursts and lulls are longer than by chance.
-
-    Args:
-        burst: how many times longer; 1 is chance. The chain's autocorrelation is 1 - 1 / burst.
-    """
-
-    burst: float = 1.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.burst < 1:
-            raise ValueOutOfRange(f"bursts are 1 or more times as long as by chance, not {self.burst}")
-
-    @static
-    def began(self, rates):
-        """Whether the background sounded before time began: as often as ever."""
-        return Bernoulli(rates[2])
-
-    @state
-    def noisy(self, rates, prev_noisy=began):
-        """Whether the background sounds."""
-        return Bernoulli(rates[2] / self.burst + (1 - 1 / self.burst) * prev_noisy)
-
-    @observation
-    def sound(self, responsive, rates, timer, noisy):
-        """Whether there was a sound."""
-        return super().sound(responsive, torch.cat([rates[:2], noisy[None]]), timer)
-
-
-@dataclass(frozen=True)
-class World:
-    """What a session happens in: a model, whether somebody is there, the rates (echo, answers, background).
-
-    ``heard``: an engine can infer by this model; ``planned``: a plan can be made for it; ``strange``: it is not as the
-    agent believes.
-    """
-
-    name: str
-    model: Any
-    truth: int
-    rates: tuple[float, ...]
-    heard: bool = True
-    planned: bool = True
-    strange: bool = True
-
-
-def _worlds(config: Any, model: Any) -> list[World]:
-    plain = {field.name: getattr(model, field.name) for field in fields(model)}
-    rates = tuple(config.rates)
-    noisy, talking = (*rates[:2], config.noise), (*rates[:2], config.talk)
-    found = [World(f"own.{name}", model, truth, rates, strange=False) for truth, name in enumerate(TRUTHS)]
-    found += [World("talker", model, 0, talking, strange=False)]
-    found += [World(f"late.{n}", _later(model, n), 1, rates, strange=n > 0) for n in config.late]
-    found += [World("twice", Twice(again=tuple(config.again), **plain), 1, rates)]
-    # No plan can be made for who remembers sounds, and no engine counts a background that is a chain.
-    for chat in config.chats:
-        chatting = (rates[0], chat, rates[2])
-        found.append(World(f"chatterbox.{chat:g}", Chatterbox(**plain), 1, chatting, planned=False))
-    for truth, name in enumerate(BURSTY):
-        for burst in config.bursts:
-            world = Bursty(burst=float(burst), **plain)
-            found.append(World(f"{name}.{burst:g}", world, truth, noisy, False, False, burst > 1))
-    return found + [World(f"echo.{n}", _later(model, n, True), 0, rates, strange=n > 0) for n in config.echoes]
-
-
-def _later(model: Any, steps: int, echoing: bool = False) -> Any:
-    """Answers come so much later; the echo ends as much later, or when it did."""
-    window, (begin, end) = tuple(step + steps for step in model.window), model.echo
-    return model.replace(window=window, echo=(begin, end + steps * echoing))
-
 
 # The sessions.
 
@@ -215,7 +94,7 @@ def misspecified(config: Any, folder: Path, console: Console) -> Result:
     model = instantiate(config.model)
     steps, horizon, episodes = QUICK if config.quick else (config.steps, config.horizon, config.episodes)
     _check(config, steps, horizon, episodes)
-    worlds, agents = _worlds(config, model), _Agents(model, steps, horizon, config.every)
+    worlds, agents = worlds_of(config, model), _Agents(model, steps, horizon, config.every)
     measured: dict[tuple[str, str, str], dict[str, np.ndarray]] = {}
     courses: dict[tuple[str, str, str], np.ndarray] = {}
     for world in tracked(worlds, "listening"):
@@ -244,7 +123,7 @@ def misspecified(config: Any, folder: Path, console: Console) -> Result:
     data.attrs = {"model": repr(model), "steps": steps, "horizon": horizon}
     summary = _summary(data, worlds, model)
     _tell(console, data, summary, worlds)
-    return Result(summary, {"misspecified": data}, {"misspecified": _draw(data, worlds)})
+    return Result(summary, {"misspecified": data}, {"misspecified": draw(data, worlds)})
 
 
 def _check(config: Any, steps: int, horizon: int, episodes: int) -> None:
@@ -485,48 +364,3 @@ def _shares(summary: dict[str, float], members: list[str], agent: str) -> str:
         )
         + " %"
     )
-
-
-def _draw(data: xr.Dataset, worlds: list[World]) -> Any:
-    rows = 0.27 * len(worlds)
-    figure = plt.figure(figsize=(14, 4.5 + rows), layout="constrained")
-    parts: Any = figure.subfigures(2, 1, height_ratios=[4, rows])
-    above, below = parts
-    left, right = above.subplots(1, 2, sharey=True)
-    _draw_courses(left, data, [w.name for w in worlds if w.truth and not w.name.startswith(BURSTY)])
-    _draw_courses(right, data, [w.name for w in worlds if not w.truth])
-    left.set(title="somebody is there", ylabel="P(truth), mean of planned sessions")
-    right.set(title="nobody is there")
-    decisions, surprises, calls = below.subplots(1, 3, sharey=True)
-    there = data.sel(rates="fixed").drop_vars("course").mean("episode")
-    y = np.arange(len(worlds))
-    _draw_decisions(decisions, there.sel(agent="planned"), y)
-    for agent, style in zip(data.agent.values.tolist(), cycle(MARKS), strict=False):
-        surprises.plot(there.surprise.sel(agent=agent), y, style, ms=5, label=agent)
-        calls.plot(there.calls.sel(agent=agent), y, style, ms=5, label=agent)
-    surprises.plot(there.entropy.sel(agent="planned"), y, "k|", ms=9, label="planned believes")
-    surprises.set(xscale="log", xlabel="−log₂ P(truth) in the end, mean (bits)")
-    calls.set(xlabel="calls in a session, mean", xlim=(0, None))
-    decisions.set_yticks(y, data.world.values.tolist())
-    decisions.set_ylim(len(worlds) - 0.4, -0.6)
-    for axis in (decisions, surprises, calls):
-        axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=3, fontsize=9)
-        axis.grid(axis="y", alpha=0.3)
-    return figure
-
-
-def _draw_courses(axis: Any, data: xr.Dataset, names: list[str]) -> None:
-    colours = plt.get_cmap("tab20")
-    for i, name in enumerate(names):
-        axis.plot(data.time, data.course.sel(world=name, rates="fixed", agent="planned"), color=colours(i), label=name)
-    axis.set(xlabel="step", ylim=(-0.02, 1.02))
-    axis.legend(loc="center left", bbox_to_anchor=(1, 0.5), fontsize=9)
-
-
-def _draw_decisions(axis: Any, shares: xr.Dataset, y: np.ndarray) -> None:
-    left = np.zeros(len(y))
-    for name, colour in (("right", "C2"), ("undecided", "lightgrey"), ("wrong", "C3")):
-        axis.barh(y, shares[name], left=left, color=colour, label=name)
-        left = left + shares[name].values
-    axis.plot(shares.in_the_sand, y, "kx", ms=5, clip_on=False, label="head in the sand")
-    axis.set(xlabel="share of planned sessions, in the end", xlim=(0, 1))

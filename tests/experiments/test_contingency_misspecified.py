@@ -6,7 +6,7 @@ import torch
 from scipy.special import betaln, expit, logit
 
 from apmodels import Contingency, ValueOutOfRange
-from experiments.contingency_misspecified import Bursty, Chatterbox, Twice
+from experiments.contingency_worlds import Bursty, Chatterbox, Twice
 from hardware import Simulated
 from inference import Exact
 from tests.experiments.test_cli import apmodels, one_sentence
