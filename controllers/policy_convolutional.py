@@ -25,13 +25,18 @@ class ConvolutionalPolicy(Policy):
         features: see Policy; the belief itself by default.
         spread: see Policy.
         seed: see Policy.
+        spacing: of the distances that have a weight, in cells, from 0 on; between them kernels are straight lines. By
+            default each distance between two cells has a weight, as in the thesis; on large grids those are many, and
+            few weights are learned with less noise.
 
-    ``weights`` are (F, R), one for each of ``distances`` (R,), in cells.
+    ``weights`` are (F, R), one for each of ``knots`` (R,), in cells; ``kernels`` (F, D), at ``distances`` (D,), follow.
     """
 
     # Up to so many cells a product of matrices is quicker than FFT.
     DENSE = 500
     distances: Tensor
+    knots: Tensor
+    lines: Tensor
     lookup: Tensor
     places: Tensor
 
@@ -42,15 +47,21 @@ class ConvolutionalPolicy(Policy):
         features: Sequence[str] = ("belief",),
         spread: float = 0.0,
         seed: int = 0,
+        spacing: float | None = None,
     ):
+        if spacing is not None and not 0 < spacing < float("inf"):
+            raise ValueOutOfRange(f"the distances that have a weight are some way apart, not {spacing} cells")
         if width is not None and not width >= 0:
             raise ValueOutOfRange(f"a kernel is 0 cells wide or more, not {width}")
         squares = _squares(torch.arange(grid.rows), torch.arange(grid.columns))
         reach = float("inf") if width is None else width**2
         tied = torch.unique(squares[squares <= reach])
-        super().__init__((len(tied),), features, spread, seed)
-        self.grid, self.width = grid, width
-        self.register_buffer("distances", tied.to(torch.get_default_dtype()).sqrt(), persistent=False)
+        distances = tied.to(torch.get_default_dtype()).sqrt()
+        knots, lines = _between_knots(distances, spacing)
+        super().__init__((len(knots),), features, spread, seed)
+        self.grid, self.width, self.spacing = grid, width, spacing
+        for name, value in {"distances": distances, "knots": knots, "lines": lines}.items():
+            self.register_buffer(name, value, persistent=False)
         # Which weight belongs to offsets (rows, columns); beyond the width one that is always zero.
         lookup = torch.where(squares <= reach, torch.searchsorted(tied, squares), len(tied))
         self.register_buffer("lookup", lookup, persistent=False)
@@ -74,7 +85,7 @@ class ConvolutionalPolicy(Policy):
 
     def forward(self, probs: Tensor) -> Tensor:
         """Return the logits of actions, (*batch, N)."""
-        kernels = nn.functional.pad(self.weights, (0, 1)).index_select(1, self.places)
+        kernels = nn.functional.pad(self.kernels, (0, 1)).index_select(1, self.places)
         seen = self.featured(probs)
         if self.grid.size <= self.DENSE:
             return seen.flatten(-2) @ kernels.reshape(-1, self.grid.size)
@@ -84,16 +95,22 @@ class ConvolutionalPolicy(Policy):
         return whole[..., : self.grid.rows, : self.grid.columns].flatten(-2)
 
     @property
+    def kernels(self) -> Tensor:
+        """The weights of all distances, (F, D)."""
+        return self.weights if self.spacing is None else self.weights @ self.lines
+
+    @property
     def filters(self) -> Tensor:
         """The kernels as images, (F, 2 rows - 1, 2 columns - 1), their centres in the middle."""
         rows, columns = (torch.arange(1 - n, n).abs() for n in self.lookup.shape)
         places = self.lookup[rows][:, columns].to(self.weights.device)
-        return nn.functional.pad(self.weights.detach(), (0, 1))[:, places]
+        return nn.functional.pad(self.kernels.detach(), (0, 1))[:, places]
 
     def about(self) -> dict[str, Any]:
         """Return what it was made with, but for the weights."""
         grid = [self.grid.rows, self.grid.columns]
-        return {"states": self.grid.size, "actions": self.grid.size, "grid": grid, "width": self.width}
+        made = {"grid": grid, "width": self.width, "spacing": self.spacing}
+        return {"states": self.grid.size, "actions": self.grid.size, **made}
 
     def serves(self, engine: Engine) -> None:
         """Raise Refusal where the action is no cell of the grid, or the interest has other values."""
@@ -113,11 +130,11 @@ class ConvolutionalPolicy(Policy):
 
         count = len(self.features)
         figure, panels = plt.subplots(1, 1 + count, figsize=(4 + 4 * count, 4), layout="constrained")
-        distances, filters = self.distances.cpu().numpy(), self.filters.cpu().numpy()
+        knots, filters = self.knots.cpu().numpy(), self.filters.cpu().numpy()
         for panel, name, weights, image in zip(
             panels[1:], self.features, self.weights.detach().cpu().numpy(), filters, strict=True
         ):
-            panels[0].plot(distances, weights, "o-", markersize=3, label=name)
+            panels[0].plot(knots, weights, "o-", markersize=3, label=name)
             (rows, columns), most = image.shape, float(abs(image).max())
             box = (-columns / 2, columns / 2, rows / 2, -rows / 2)
             shown = panel.imshow(image, extent=box, cmap="RdBu_r", vmin=-most, vmax=most)
@@ -135,6 +152,14 @@ def between(grid: Grid, lookup: Tensor) -> Tensor:
     cells = grid.values()
     offset = grid.offset(cells[:, None], cells).abs()
     return lookup[offset[..., 0], offset[..., 1]].flatten()
+
+
+def _between_knots(distances: Tensor, spacing: float | None) -> tuple[Tensor, Tensor]:
+    """Return the distances that have a weight, (R,), and how much each counts at all distances, (R, D)."""
+    if spacing is None:
+        return distances, torch.empty(0)
+    knots = torch.arange(int(torch.ceil(distances.max() / spacing)) + 1).to(distances) * spacing
+    return knots, (1 - (distances - knots[:, None]).abs() / spacing).clamp(min=0)
 
 
 def _squares(rows: Tensor, columns: Tensor) -> Tensor:

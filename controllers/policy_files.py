@@ -63,7 +63,7 @@ def _logistic(made: dict[str, Any]) -> Any:
 def _convolutional(made: dict[str, Any]) -> Any:
     from controllers.policy_convolutional import ConvolutionalPolicy
 
-    return ConvolutionalPolicy(Grid(*made["grid"]), made["width"], made["features"])
+    return ConvolutionalPolicy(Grid(*made["grid"]), made["width"], made["features"], spacing=made.get("spacing"))
 
 
 POLICIES: dict[str, Callable[[dict[str, Any]], Any]] = {

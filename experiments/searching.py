@@ -98,7 +98,7 @@ def error_of(correct: np.ndarray, share: float, seed: int = 0) -> float:
 def learned(engine: Any, settings: Any, seed: int, reward: Any = None) -> tuple[PolicyGradient, xr.Dataset, float]:
     """Learn where to look with a convolutional policy; return it, its course, and the seconds it took."""
     grid = engine.model.grid
-    policy = ConvolutionalPolicy(grid, features=tuple(settings.features))
+    policy = ConvolutionalPolicy(grid, features=tuple(settings.features), spacing=settings.spacing)
     learner = PolicyGradient(
         engine,
         policy,
@@ -121,4 +121,4 @@ def learned(engine: Any, settings: Any, seed: int, reward: Any = None) -> tuple[
 def kernel(learner: PolicyGradient) -> tuple[np.ndarray, np.ndarray]:
     """Return distances, in cells, and the weights of a convolutional policy's first feature at them, (R,)."""
     policy: Any = learner.policy
-    return policy.distances.numpy(), policy.weights.detach()[0].numpy()
+    return policy.distances.cpu().numpy(), policy.kernels.detach()[0].cpu().numpy()

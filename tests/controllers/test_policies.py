@@ -51,6 +51,24 @@ def test_convolution_is_a_sum_over_cells(dense, width, rows, columns, monkeypatc
     torch.testing.assert_close(policy(probs[0]), policy(probs)[0], atol=2e-5, rtol=1e-4)
 
 
+@pytest.mark.parametrize("dense", [500, 0], ids=["matrix", "fft"])
+@pytest.mark.parametrize("spacing", [0.5, 1, 1.7, 100.0])
+@pytest.mark.parametrize("width", [None, 3])
+def test_between_knots_kernels_are_straight_lines(dense, spacing, width, monkeypatch, tmp_path):
+    monkeypatch.setattr(ConvolutionalPolicy, "DENSE", dense)
+    few = ConvolutionalPolicy(Grid(4, 6), width, EVERY, spread=1.0, seed=3, spacing=spacing)
+    assert few.weights.shape == (5, len(few.knots)) and float(few.knots[-1]) >= float(few.distances[-1])
+    every = ConvolutionalPolicy(Grid(4, 6), width, EVERY)
+    with torch.no_grad():
+        for kernel, weights in zip(every.weights, few.weights.numpy(), strict=True):
+            kernel.copy_(torch.tensor(np.interp(few.distances.numpy(), few.knots.numpy(), weights)))
+    torch.testing.assert_close(few(beliefs(24)), every(beliefs(24)), atol=2e-5, rtol=1e-4)
+    torch.testing.assert_close(few.filters, every.filters)
+    few.save(tmp_path / "few.npz")
+    again = controllers.load(tmp_path / "few.npz")
+    assert torch.equal(again(beliefs(24)), few(beliefs(24))) and again.spacing == spacing
+
+
 def test_both_ways_to_convolve_have_the_same_gradient(monkeypatch):
     found = []
     for dense in (500, 0):
@@ -151,6 +169,8 @@ def test_pictures(features):
         (lambda: ConvolutionalPolicy(Grid(3, 3), features=()), "needs a feature"),
         (lambda: ConvolutionalPolicy(Grid(3, 3), width=-1), "wide"),
         (lambda: ConvolutionalPolicy(Grid(3, 3), spread=-1.0), "spread"),
+        (lambda: ConvolutionalPolicy(Grid(3, 3), spacing=0), "apart"),
+        (lambda: ConvolutionalPolicy(Grid(3, 3), spacing=float("nan")), "apart"),
         (lambda: LogisticPolicy(0, 2), "1 value"),
         (lambda: LogisticPolicy(4, 4).tied(Grid(3, 3)), "9 cells"),
     ],
