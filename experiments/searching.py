@@ -87,12 +87,18 @@ def fixations_to(correct: np.ndarray, share: float) -> float:
     return float(at - 1 + (share - curve[at - 1]) / (curve[at] - curve[at - 1]))
 
 
-def error_of(correct: np.ndarray, share: float, seed: int = 0) -> float:
-    """Standard error of ``fixations_to``, by trials drawn anew."""
+def error_of(correct: np.ndarray, share: float, other: np.ndarray | None = None, seed: int = 0) -> float:
+    """Standard error of ``fixations_to``, or of its difference from that of other trials with the same targets.
+
+    By trials drawn anew; NaN where most of those never reach the share.
+    """
     random = np.random.default_rng(seed)
     drawn = random.multinomial(len(correct), np.full(len(correct), 1 / len(correct)), RESAMPLED) / len(correct)
-    found = [fixations_to(curve[None], share) for curve in drawn @ correct]
-    return float(np.nanstd(found))
+    found = np.array([fixations_to(curve[None], share) for curve in drawn @ correct])
+    if other is not None:
+        found = found - [fixations_to(curve[None], share) for curve in drawn @ other]
+    there = found[np.isfinite(found)]
+    return float(there.std()) if len(there) > RESAMPLED / 2 else np.nan
 
 
 def learned(engine: Any, settings: Any, seed: int, reward: Any = None) -> tuple[PolicyGradient, xr.Dataset, float]:

@@ -36,7 +36,11 @@ def table_5_1(config: Any, folder: Path, console: Console) -> Result:
             if np.isfinite(found)
             else f"{name:16} does not get there in {data.fixation.size} fixations{beside}"
         )
-    console.print(f"learned in {summary['learning_seconds']:.0f} s")
+    console.print(
+        f"learned in {summary['learning_seconds']:.0f} s; in the same trials percent_correct needs "
+        f"{summary['percent_correct.later']:+.2f} ± {summary['percent_correct.later.se']:.2f} fixations more, and "
+        f"{summary['percent_correct.ms'] / summary['learned.ms']:,.0f} times as long for a decision"
+    )
     return Result(summary, {"table_5_1": data}, {"table_5_1": _bars(data, summary)})
 
 
@@ -81,6 +85,10 @@ def _race(config: Any, folder: Path) -> tuple[xr.Dataset, dict[str, float]]:
         summary[name] = fixations_to(part.correct.values, config.share)
         summary[f"{name}.se"] = error_of(part.correct.values, config.share)
         summary[f"{name}.ms"] = float(part.seconds.mean()) * 1e3 / data.trial.size
+        if name != "learned":
+            best = data.correct.sel(controller="learned").values
+            summary[f"{name}.later"] = summary[name] - summary["learned"]
+            summary[f"{name}.later.se"] = error_of(part.correct.values, config.share, best)
     summary["learning_seconds"] = seconds
     return data, summary
 

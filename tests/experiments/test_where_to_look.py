@@ -35,6 +35,14 @@ def test_errors_are_those_of_trials_drawn_anew():
     assert error_of(np.maximum.accumulate(found[0], 1), 0.7) == pytest.approx(spread, rel=0.3)
 
 
+def test_differences_are_of_the_same_trials():
+    random = np.random.default_rng(0)
+    one, other = (np.maximum.accumulate(random.random((400, 12)) < np.linspace(0.05, 0.95, 12), 1) for _ in range(2))
+    assert error_of(one, 0.7, one) == 0
+    assert error_of(one, 0.7, other) == pytest.approx(np.hypot(error_of(one, 0.7), error_of(other, 0.7)), rel=0.2)
+    assert np.isnan(error_of(np.zeros((5, 4)), 0.7))
+
+
 def test_a_search_is_right_as_often_as_it_believes():
     model = VisualSearch(grid=Grid(3, 3))
     engine = engine_of(model)
@@ -63,6 +71,7 @@ def test_table_5_1(tmp_path):
     found, data, said = run(tmp_path, "table_5_1", *words)
     for name in ("learned", "percent_correct", "entropy_limit", "most_probable", "random"):
         assert name in said and name in found and f"{name}.se" in found
+    assert found["random.later"] == pytest.approx(found["random"] - found["learned"])
     assert found["thesis.learned"] == 7.86 and found["learning_seconds"] > 0
     assert data.sizes["trial"] == 64
     # What took long is not done again.
