@@ -101,10 +101,13 @@ def error_of(correct: np.ndarray, share: float, other: np.ndarray | None = None,
     return float(there.std()) if len(there) > RESAMPLED / 2 else np.nan
 
 
-def learned(engine: Any, settings: Any, seed: int, reward: Any = None) -> tuple[PolicyGradient, xr.Dataset, float]:
-    """Learn where to look with a convolutional policy; return it, its course, and the seconds it took."""
-    grid = engine.model.grid
-    policy = ConvolutionalPolicy(grid, features=tuple(settings.features), spacing=settings.spacing)
+def learned(
+    engine: Any, settings: Any, seed: int, reward: Any = None, policy: Any = None
+) -> tuple[PolicyGradient, xr.Dataset, float]:
+    """Learn where to look, with a convolutional policy by default; return it, its course, and the seconds it took."""
+    if policy is None:
+        grid, features = engine.model.grid, tuple(settings.features)
+        policy = ConvolutionalPolicy(grid, features=features, spacing=settings.spacing)
     learner = PolicyGradient(
         engine,
         policy,

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from apmodels import ValueOutOfRange, WanderingSearch
 from apmodels.progress import tracked
-from controllers import Falling, Fixated, Information, LogisticPolicy, PolicyGradient
+from controllers import Fixated, Information, LogisticPolicy
 from experiments.searching import engine_of, error_of, fixations_to, kernel, learned, search
 from experiments.study import Result, remembered
 
@@ -201,17 +201,9 @@ def weight_sharing(config: Any, folder: Path, console: Console) -> Result:
         return course.assign(weights=len(_distances(model)))
 
     def loose() -> xr.Dataset:
-        policy = LogisticPolicy(model.grid.size, model.grid.size)
-        learner = PolicyGradient(
-            engine,
-            policy,
-            steps=free.steps,
-            batch=free.batch,
-            rate=Falling(free.rate, free.updates),
-            damping=free.damping,
-            seed=config.seed,
-        )
-        return learner.learn(free.updates).assign(weights=model.grid.size**2)
+        cells = model.grid.size
+        _, course, _ = learned(engine, free, config.seed, policy=LogisticPolicy(cells, cells))
+        return course.assign(weights=cells**2)
 
     found = {
         "shared": remembered(folder, "shared", [repr(model), str(settings), config.seed], shared),

@@ -1,0 +1,78 @@
+"""Sharing a gaze shift among motors whose noise grows with what they are told (thesis sections 6.6.3 and 6.8.7)."""
+
+from __future__ import annotations
+
+import torch
+from scipy.optimize import lsq_linear
+from torch import Tensor
+
+from apmodels import ValueOutOfRange
+
+
+def gaze_shift(
+    actuation: Tensor,
+    noise: Tensor,
+    goal: Tensor,
+    low: Tensor | float | None = None,
+    high: Tensor | float | None = None,
+) -> Tensor:
+    """Return the commands after which the gaze is expected to be nearest its goal, in squared distance (eq. 6.67).
+
+    u = [diag(1ᵀ(n ∘ n)) + aᵀa]⁻¹ aᵀ m: more of the surer motors, and a little less than all the way. Of motors without
+    noise that can replace each other, the least of each (a pseudo-inverse).
+
+    Args:
+        actuation: a, how far a unit of each motor moves the gaze, (*batch, D, K), pixels or degrees a unit.
+        noise: n, the standard deviation that a unit of each motor adds, (*batch, D, K), independent of each other's.
+        goal: m, where to, (*batch, D).
+        low: the least command of each motor, (*batch, K) or one for all; no limit by default.
+        high: the largest, likewise.
+
+    Returns:
+        Commands, (*batch, K), double precision.
+    """
+    a, n, m = (torch.as_tensor(value, dtype=torch.float64) for value in (actuation, noise, goal))
+    if a.dim() < 2 or n.shape[-2:] != a.shape[-2:] or m.shape[-1:] != a.shape[-2:-1]:
+        raise ValueOutOfRange(
+            "a gaze shift needs actuation and noise (directions, motors) and a goal (directions), not "
+            f"{tuple(a.shape)}, {tuple(n.shape)} and {tuple(m.shape)}"
+        )
+    if not all(bool(torch.isfinite(value).all()) for value in (a, n, m)):
+        raise ValueOutOfRange("a gaze shift needs finite actuation, noise and goal")
+    square = torch.diag_embed((n * n).sum(-2)) + a.mT @ a
+    slope = (a.mT @ m[..., None])[..., 0]
+    free = (torch.linalg.pinv(square, hermitian=True) @ slope[..., None])[..., 0]
+    if low is None and high is None:
+        return free
+    return _bounded(a, (n * n).sum(-2).sqrt(), m, free, *_limits(low, high, free))
+
+
+def expected_error(actuation: Tensor, noise: Tensor, goal: Tensor, command: Tensor) -> Tensor:
+    """Return the expected squared distance from the goal after a command, (*batch,) (eq. 6.62)."""
+    a, n, m, u = (torch.as_tensor(value, dtype=torch.float64) for value in (actuation, noise, goal, command))
+    missed = m - (a @ u[..., None])[..., 0]
+    return (missed * missed).sum(-1) + ((n * n).sum(-2) * u * u).sum(-1)
+
+
+def _limits(low: Tensor | float | None, high: Tensor | float | None, free: Tensor) -> tuple[Tensor, Tensor]:
+    least = torch.as_tensor(-torch.inf if low is None else low, dtype=torch.float64).expand(free.shape)
+    most = torch.as_tensor(torch.inf if high is None else high, dtype=torch.float64).expand(free.shape)
+    if not bool((least <= most).all()):
+        raise ValueOutOfRange("a motor's least command is larger than its largest")
+    return least, most
+
+
+def _bounded(actuation: Tensor, spread: Tensor, goal: Tensor, free: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """The best commands between limits, least squares; only those that would pass a limit are looked for."""
+    found = torch.minimum(torch.maximum(free, low), high)
+    motors, ways = free.shape[-1], actuation.shape[-2]
+    past = (found != free).any(-1).flatten().nonzero()[:, 0].tolist()
+    flat, low, high = (value.reshape(-1, motors) for value in (found, low, high))
+    a = actuation.expand(*free.shape[:-1], ways, motors).reshape(-1, ways, motors)
+    rows = torch.cat([a, torch.diag_embed(spread.expand(free.shape).reshape(-1, motors))], 1).numpy()
+    sides = torch.nn.functional.pad(goal.expand(*free.shape[:-1], ways).reshape(-1, ways), (0, motors)).numpy()
+    for i in past:
+        limits = low[i].numpy(), high[i].numpy()
+        flat[i] = torch.as_tensor(lsq_linear(rows[i], sides[i], limits, method="bvls", tol=1e-14).x)
+    # The solver may pass a limit by a rounding, and a motor must not.
+    return torch.minimum(torch.maximum(flat, low), high).reshape(found.shape)
