@@ -23,7 +23,8 @@ def gaze_shift(
 
     Args:
         actuation: a, how far a unit of each motor moves the gaze, (*batch, D, K), pixels or degrees a unit.
-        noise: n, the standard deviation that a unit of each motor adds, (*batch, D, K), independent of each other's.
+        noise: n, the standard deviation that a unit of each motor adds, (*batch, D, K), independent of each other's; a
+            motor of infinite noise is not used.
         goal: m, where to, (*batch, D).
         low: the least command of each motor, (*batch, K) or one for all; no limit by default.
         high: the largest, likewise.
@@ -37,8 +38,11 @@ def gaze_shift(
             "a gaze shift needs actuation and noise (directions, motors) and a goal (directions), not "
             f"{tuple(a.shape)}, {tuple(n.shape)} and {tuple(m.shape)}"
         )
-    if not all(bool(torch.isfinite(value).all()) for value in (a, n, m)):
-        raise ValueOutOfRange("a gaze shift needs finite actuation, noise and goal")
+    if not bool(torch.isfinite(a).all() and torch.isfinite(m).all()) or bool(torch.isnan(n).any()):
+        raise ValueOutOfRange("a gaze shift needs finite actuation and goal, and noise that is a number")
+    # Who is not to be relied upon at all is not used.
+    useless = torch.isinf(n).any(-2, keepdim=True)
+    a, n = torch.where(useless, 0.0, a), torch.where(useless, 1.0, n)
     square = torch.diag_embed((n * n).sum(-2)) + a.mT @ a
     slope = (a.mT @ m[..., None])[..., 0]
     free = (torch.linalg.pinv(square, hermitian=True) @ slope[..., None])[..., 0]

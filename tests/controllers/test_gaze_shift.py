@@ -61,6 +61,13 @@ def test_without_noise_it_is_the_pseudo_inverse_also_where_motors_replace_each_o
     assert bounded.tolist() == pytest.approx([0.5, 1.5, 0.0])
 
 
+def test_a_motor_that_cannot_be_relied_upon_is_not_used():
+    a, n, m = head(3)
+    n[1, 2] = torch.inf
+    found = gaze_shift(a, n, m)
+    torch.testing.assert_close(found, torch.nn.functional.pad(gaze_shift(a[:, :2], n[:, :2], m), (0, 1)))
+
+
 def test_batches_are_their_members():
     heads = [head(3, seed=s) for s in range(5)]
     a, n, m = (torch.stack(parts) for parts in zip(*heads, strict=True))
