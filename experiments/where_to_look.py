@@ -48,11 +48,16 @@ def curves(config: Any, folder: Path, console: Console) -> Result:
     """Draw how many searches are right after every fixation; see ``conf/experiment/where_to_look/curves.yaml``."""
     data, summary = _race(config, folder)
     best = data.correct.mean("trial")
-    learned_best = (best.sel(controller="learned") - best.sel(controller="percent_correct")).values
-    summary["learned_ahead_from"] = float(np.argmax(learned_best > 0) + 1) if (learned_best > 0).any() else np.nan
+    ahead = (data.correct.sel(controller="learned") - data.correct.sel(controller="percent_correct")).values
+    lead, at = ahead.mean(0), int(np.abs(ahead.mean(0)).argmax())
+    error = float(ahead[:, at].std()) / len(ahead) ** 0.5
+    summary |= {"lead": float(lead[at]), "lead.se": error, "lead_at": at + 1.0}
     for name in data.controller.values.tolist():
         shares = ", ".join(f"{float(best.sel(controller=name, fixation=t)):.2f}" for t in (1, 2, 4, 8, 12))
         console.print(f"{name:16} right after 1, 2, 4, 8, 12 fixations: {shares}")
+    console.print(
+        f"learned and percent_correct are farthest apart after {at + 1} fixations, by {lead[at]:+.3f} ± {error:.3f}"
+    )
     figure, axis = plt.subplots(figsize=(7, 5), layout="constrained")
     for name in data.controller.values.tolist():
         axis.plot(data.fixation, best.sel(controller=name), "o-", ms=3, label=name)
