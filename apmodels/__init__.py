@@ -17,6 +17,7 @@ from apmodels.detector_search import DetectorSearch as DetectorSearch
 from apmodels.errors import DeclarationError as DeclarationError
 from apmodels.errors import ValueOutOfRange as ValueOutOfRange
 from apmodels.evidence import Evidence as Evidence
+from apmodels.learning_to_look import LearningToLook as LearningToLook
 from apmodels.model import Model as Model
 from apmodels.planted import Planted as Planted
 from apmodels.spaces import Binary as Binary

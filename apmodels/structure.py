@@ -227,12 +227,26 @@ class _Reader:
         bad = next((arrow for arrow in out if arrow.kind == "nonlinear"), None)
         if bad is not None:
             return "sampled", f"{bad.child} depends on it nonlinearly ({bad.why})"
+        through = self._sampled_function_of(name, {name})
+        if through is not None:
+            return "sampled", f"{through} is a function of it, and must be sampled"
         own = self._family(name)
         if own in CONJUGATE and out and all(arrow.kind == "selects" for arrow in out):
             return "counted", f"conjugate: {own} counts of {CONJUGATE[own]} outcomes"
         if own in (*GAUSSIAN, "deterministic"):
             return "integrated", "Gaussian, and every child is affine in it"
         return "sampled", f"a {own} has no algebra with its children"
+
+    def _sampled_function_of(self, name: str, met: set[str]) -> str | None:
+        """Return a deterministic child that some variable depends on nonlinearly, itself or by way of another."""
+        for arrow in self.arrows:
+            child = arrow.child
+            if arrow.parent != name or child in met or child in self.known or self.probe.is_random(child):
+                continue
+            out = [other for other in self.arrows if other.parent == child]
+            if any(other.kind == "nonlinear" for other in out) or self._sampled_function_of(child, met | {child}):
+                return child
+        return None
 
 
 def _with_befores(variable: Variable) -> list[Parent]:

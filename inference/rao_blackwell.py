@@ -20,12 +20,16 @@ from inference.records.record import Record
 from inference.records.swarm import Swarm
 from inference.worlds.bank import Bank
 from inference.worlds.gaussian import Gaussian
+from inference.worlds.gaussian_block import predicted, seen_by
+from inference.worlds.offsets import NoTranslation, Offsets, displacements
 from inference.worlds.plan import Plan, make_plan
 from inference.worlds.rejuvenation import Past, forgotten, rejuvenated
 from inference.worlds.step import BankBelief, Step, even, pick, take_worlds
 
 # How many values are tried where one particle is kept.
 CANDIDATES = 256
+# Displacements are looked for where their standard deviation is more than so much of a pixel.
+FINE = 0.3
 
 
 class DepletionWarning(UserWarning):
@@ -71,6 +75,7 @@ class RaoBlackwell(Bank):
         statics = self.model.declaration.names["static"]
         self.guide: Any = None
         self._swarm: Swarm | None = None
+        self.offsets = {d.name: Offsets(self, d) for d in displacements(self.structure, self.plan, self.images)}
         self.sampled_statics = [name for name in self.plan.worlds if name in statics]
 
     def divide(self, structure: Structure, given: str | Iterable[str]) -> Plan:
@@ -145,15 +150,21 @@ class RaoBlackwell(Bank):
 
     def update(self, belief: BankBelief, action: Any, observation: Any) -> BankBelief:
         """Return the belief after one more action and observation."""
-        rows = len(belief.log_weights)
+        rows, before = len(belief.log_weights), belief
         actions, seen = self._actions(action, rows), self.seen_as(observation, rows)
         with seeded(self.seed * 1_000_003 + belief.time + 1):
             if self.particles > 1:
                 belief = self.refreshed(belief)
-            elif belief.log_weights.shape[1] == 1:
+            elif belief.log_weights.shape[1] == 1 and not self.offsets:
                 belief = spread(belief, self.candidates)
             step, known = self.step_of(belief, actions)
-            step = self.propagate(step, seen)
+            step.seen = seen
+            try:
+                step = self.propagate(step, seen)
+            except NoTranslation:
+                # The graph would have allowed it, the laws do not: values are tried, as for any other variable.
+                self.offsets = {}
+                return self.update(before, action, observation)
             weights = belief.log_weights + step.score
             if self.particles == 1:
                 return self._best(belief, step, known | actions, weights, seen)
@@ -174,6 +185,24 @@ class RaoBlackwell(Bank):
         self.move(step)
         self.sense(step, seen)
         return step
+
+    def draw(self, step: Step, name: str, given: Tensor | None = None, birth: bool = False) -> None:
+        """Draw one variable of every world; a displacement by what is seen, of which every offset is scored."""
+        offsets = self.offsets.get(name)
+        kind, at = self.owner.get(name, ("", 0))
+        if offsets is None or kind != "gaussian" or given is not None or step.seen is None:
+            return super().draw(step, name, given, birth)
+        block = self.gaussians[at]
+        belief = block.advance(step.gaussian[at], step.frame, name, birth)
+        view = block.view(step.frame, name, birth)
+        prior = predicted(belief, view)
+        if not self.chooses and not bool((torch.linalg.eigvalsh(prior.covariance) > FINE**2).all()):
+            # Where it is known to a fraction of a pixel, a draw of its own does better.
+            return super().draw(step, name, given, birth)
+        value, chosen, expected = offsets.choose(step, prior, step.seen, best=self.chooses)
+        step.gaussian[at], log_p = seen_by(belief, view, value)
+        step.score = step.score + (expected if self.chooses else log_p.to(self.dtype)) - chosen
+        step.frame.values[name, 0] = value
 
     def refreshed(self, belief: BankBelief, many: Tensor | None = None) -> BankBelief:
         """Resample where the effective number of particles is low, and rejuvenate what is static."""

@@ -47,6 +47,8 @@ class Step:
     prior: Tensor
     # The worlds' statics, where they are given instead of drawn.
     given: Values | None = None
+    # What is seen after the step, where what is drawn may depend on it.
+    seen: Values | None = None
 
 
 def drawn(belief: Gaussian, lead: tuple[int, int]) -> Tensor:

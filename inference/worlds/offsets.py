@@ -1,0 +1,224 @@
+"""By how much an image has been moved: every offset of a lattice is scored at once (thesis eqs 6.34 to 6.40)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from scipy.fft import next_fast_len
+from torch import Tensor
+
+from apmodels.simulation import Values
+from apmodels.structure import Structure
+from inference.worlds.field_block import FieldBlock, Images
+from inference.worlds.frame import Frame
+from inference.worlds.gaussian import Gaussian
+from inference.worlds.plan import Plan
+
+# A displacement is looked for within so many of its standard deviations.
+REACH = 4.0
+# Coordinates begin here, so that what comes in from outside is told from what has a place.
+FAR = 10_000.0
+
+
+class NoTranslation(Exception):
+    """What a variable does to an image is no whole-pixel translation of all of it."""
+
+
+@dataclass(frozen=True)
+class Displacement:
+    """A sampled variable (horizontal, vertical) that moves what is seen of an image, and by nothing but that."""
+
+    name: str
+    field: int
+    seen: str
+
+
+def displacements(structure: Structure, plan: Plan, images: list[FieldBlock]) -> list[Displacement]:
+    """Return what may be a displacement, by the graph: the last that is sampled before one image is seen."""
+    drawn = [name for name in plan.worlds if structure.nodes[name].role == "state"]
+    found = []
+    for i, block in enumerate(images):
+        if len(drawn) == 1 and len(block.seen) == 1 and structure.nodes[drawn[0]].shape == (2,):
+            reached, names = {drawn[0]}, [*plan.computed, *block.states, *block.seen]
+            for name in [n for n in structure.nodes if n in names]:
+                if any(arrow.parent in reached and not arrow.lag for arrow in structure.into(name)):
+                    reached.add(name)
+            if block.seen[0] in reached:
+                found.append(Displacement(drawn[0], i, block.seen[0]))
+    return found
+
+
+def offset_scores(seen: Tensor, mean: Tensor, variance: Tensor) -> Tensor:
+    """Return log p(image) for every place in a larger image where it may be seen, nats.
+
+    Three correlations by FFT, instead of one sum over pixels for each offset.
+
+    Args:
+        seen: (*batch, h, w); NaN is missing.
+        mean: of what is seen there, (*batch, H, W), H >= h and W >= w.
+        variance: likewise; above 0.
+
+    Returns:
+        (*batch, H - h + 1, W - w + 1), by the row and column of the upper left pixel.
+    """
+    there = ~torch.isnan(seen)
+    # Centred, so that nothing large cancels.
+    middle = torch.where(there, seen, 0.0).sum() / there.sum().clamp(min=1)
+    y, m = torch.where(there, seen - middle, 0.0), mean - middle
+    weight = 1 / variance
+    shape = [int(next_fast_len(n, real=True) or n) for n in mean.shape[-2:]]
+
+    def wave(image: Tensor) -> Tensor:
+        return torch.fft.rfft2(image, s=shape)
+
+    flat = m * m * weight + variance.log() + math.log(2 * math.pi)
+    total = wave(y * y).conj() * wave(weight) - 2 * wave(y).conj() * wave(m * weight)
+    total = total + wave(there.to(y.dtype)).conj() * wave(flat)
+    rows, columns = (large - small + 1 for large, small in zip(mean.shape[-2:], seen.shape[-2:], strict=True))
+    return -0.5 * torch.fft.irfft2(total, s=shape)[..., :rows, :columns]
+
+
+class Offsets:
+    """Where the image of one field block may have been moved to by a displacement.
+
+    How a displacement moves the image is found by moving images of coordinates: the engine knows no model, and a law
+    may shift the image itself, or the window through which it is seen.
+    """
+
+    def __init__(self, bank: Any, displacement: Displacement):
+        self.bank, self.block = bank, bank.images[displacement.field]
+        self.name, self.seen, self.field = displacement.name, displacement.seen, displacement.field
+        self.outside: tuple[float, float] | None = None
+        self.sign = 0
+
+    def choose(self, step: Any, prior: Gaussian, seen: Values, best: bool) -> tuple[Tensor, Tensor, Tensor]:
+        """Return values (rows, worlds, 2) and, for each, log q(pixel) by which it was chosen and log p(pixel).
+
+        A pixel is drawn from what is believed of it once the image has been seen, and the value anywhere in it; or the
+        value is the middle of the best pixel.
+        """
+        mean = prior.mean.expand(*step.lead, 2).double()
+        # Of a whole pixel: the density in its middle, were the value spread by as much as a pixel is.
+        covariance = prior.covariance.expand(*step.lead, 2, 2).double() + torch.eye(2, dtype=torch.float64) / 12
+        joint, log_prior, pixels = self._lattice(step, mean, covariance, seen[self.seen])
+        total = joint.logsumexp(-1, keepdim=True)
+        if best:
+            at = joint.argmax(-1, keepdim=True)
+        else:
+            at = torch.distributions.Categorical(logits=joint - total, validate_args=False).sample()[..., None]
+        value = pixels.gather(2, at[..., None].expand(*at.shape, 2))[:, :, 0]
+        if not best:
+            value = value + torch.rand(value.shape, dtype=value.dtype) - 0.5
+        chosen, expected = (joint - total).gather(-1, at), log_prior.gather(-1, at)
+        return tuple(part.to(self.bank.dtype) for part in (value, chosen[..., 0], expected[..., 0]))  # type: ignore
+
+    def _lattice(self, step: Any, mean: Tensor, covariance: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """log p(pixel, image), log p(pixel), (rows, worlds, pixels), and the pixels, (rows, worlds, pixels, 2)."""
+        images = step.fields[self.field]
+        field_mean, field_variance = images[next(iter(images)) if len(images) == 1 else self.block.carried[0]]
+        near, reach = mean.round(), self._reach(covariance, field_mean.shape[-2:])
+        base, noise = self._base(step, near.to(self.bank.dtype), field_mean.shape[-2:])
+        scores = offset_scores(seen, *self._region(field_mean, field_variance + noise, base, reach, step.lead))
+        if self.sign > 0:
+            # What moves to the right was further left before.
+            scores = scores.flip(-2, -1)
+        across, down = (torch.arange(-n, n + 1, dtype=torch.float64) for n in reach)
+        pixels = near[:, :, None] + torch.stack(torch.meshgrid(across, down, indexing="xy"), -1).flatten(0, 1)
+        zero = torch.zeros(2, dtype=torch.float64)
+        law = torch.distributions.MultivariateNormal(zero, covariance[:, :, None], validate_args=False)
+        log_prior = law.log_prob(pixels - mean[:, :, None])
+        return scores.flatten(2).double() + log_prior, log_prior, pixels
+
+    def _reach(self, covariance: Tensor, shape: Any) -> tuple[int, int]:
+        """How far to look, (columns, rows): the uncertainty says, and no farther than the image is large."""
+        far = (REACH * covariance.diagonal(dim1=-2, dim2=-1).sqrt()).amax((0, 1)).ceil() + 1
+        return min(int(far[0]), int(shape[-1])), min(int(far[1]), int(shape[-2]))
+
+    def _predicted(self, step: Any, value: Tensor, mean: Tensor | float) -> tuple[Tensor, Tensor]:
+        """What would be seen, mean and variance, had the displacement this value and the image this certain mean."""
+        bank, values = self.bank, dict(step.frame.values)
+        values[self.name, 0] = value
+        frame = Frame(values)
+        for name in bank.plan.computed:
+            if bank.roles[name] == "state":
+                keys = [(p.name, p.lag) for p in bank.laws.variables[name].parents]
+                frame.values[name, 0] = frame.in_all(bank.laws, name, frame.lead(keys))  # type: ignore[assignment]
+        return self.block.predicted(self.seen, self._images(step, mean), frame)
+
+    def _images(self, step: Any, mean: Tensor | float) -> Images:
+        """The block's images, had they this mean and no variance."""
+        images: Images = {}
+        for name, (old, _) in step.fields[self.field].items():
+            image = torch.as_tensor(mean, dtype=old.dtype).expand(1, 1, *old.shape[2:])
+            images[name] = image, torch.zeros_like(image)
+        return images
+
+    def _corner(self, step: Any, value: Tensor, shape: Any) -> Tensor:
+        """The place in the image, (rows, worlds, 2) as (row, column), of the upper left pixel of what is seen."""
+        found = []
+        for axis in (0, 1):
+            line = torch.arange(shape[axis], dtype=self.bank.dtype) + FAR
+            coordinates = (line[:, None] if axis == 0 else line).expand(*shape)
+            centre, _ = self._predicted(step, value, coordinates)
+            size = centre.shape[2 + axis]
+            steps = torch.arange(size, dtype=centre.dtype)
+            origin = centre - FAR - (steps[:, None] if axis == 0 else steps)
+            inside = centre >= FAR - 1
+            if not bool(inside.flatten(2).any(-1).all()):
+                raise NoTranslation(
+                    f"nothing is seen of the image where {self.name} is {value.flatten(0, 1)[0].tolist()}"
+                )
+            low = torch.where(inside, origin, torch.inf).amin((-2, -1))
+            high = torch.where(inside, origin, -torch.inf).amax((-2, -1))
+            if not torch.equal(low, high):
+                raise NoTranslation(f"{self.name} does more to {self.seen} than to move it")
+            found.append(low)
+        return torch.stack(found, -1).expand(*step.lead, 2)
+
+    def _base(self, step: Any, near: Tensor, shape: Any) -> tuple[Tensor, float]:
+        """Where what is seen begins in the image, (rows, worlds, 2), and the variance of the noise on the way there."""
+        base = self._corner(step, near, shape)
+        centre, spread = self._predicted(step, near, FAR)
+        inside = centre >= FAR - 1
+        noise = spread[inside.expand_as(spread)]
+        if self.outside is None:
+            self._learn(step, near, base, shape)
+        if bool((noise != noise[0]).any()):
+            raise NoTranslation(f"the noise of {self.seen} is not the same in all of it")
+        return base, float(noise[0])
+
+    def _learn(self, step: Any, near: Tensor, base: Tensor, shape: Any) -> None:
+        """Find out which way the displacement moves the image, and what comes in from outside."""
+        moved = torch.tensor([3.0, -2.0], dtype=near.dtype)
+        change = self._corner(step, near + moved, shape) - base
+        for sign in (1, -1):
+            if bool((change == -sign * moved.flip(0)).all()):
+                self.sign = sign
+        if not self.sign:
+            raise NoTranslation(f"{self.name} does not move {self.seen} by whole pixels")
+        centre, spread = self._predicted(step, near + 10 * FAR, FAR)
+        if bool((centre >= FAR - 1).any()) or bool((centre != centre.flatten()[0]).any()):
+            raise NoTranslation(f"what comes into {self.seen} from outside is not all alike")
+        self.outside = float(centre.flatten()[0]), float(spread.flatten()[0])
+
+    def _region(
+        self, mean: Tensor, variance: Tensor, base: Tensor, reach: tuple[int, int], lead: tuple[int, int]
+    ) -> tuple[Tensor, Tensor]:
+        """The part of the image that may be seen, mean and variance, (rows, worlds, h + 2 down, w + 2 across)."""
+        assert self.outside is not None
+        height, width = mean.shape[-2:]
+        size = self.bank.structure.nodes[self.seen].shape
+        across, down = reach
+        rows = (base[..., 0].long() - down)[..., None] + torch.arange(size[0] + 2 * down)
+        columns = (base[..., 1].long() - across)[..., None] + torch.arange(size[1] + 2 * across)
+        inside = ((rows >= 0) & (rows < height))[..., :, None] & ((columns >= 0) & (columns < width))[..., None, :]
+        at = rows.clamp(0, height - 1)[..., :, None] * width + columns.clamp(0, width - 1)[..., None, :]
+        parts = []
+        for image, fill in zip((mean, variance), self.outside, strict=True):
+            flat = image.expand(*lead, height, width).flatten(2)
+            picked = flat.gather(2, at.flatten(2)).reshape(inside.shape)
+            parts.append(torch.where(inside, picked, fill))
+        return parts[0], parts[1]
