@@ -24,6 +24,7 @@ from apmodels.variables import Parent, Variable
 
 WORLDS = 24
 STEPS = 40
+FEWEST = 5
 # How many combinations of finite values, and how many numbers, one probe may look at.
 COMBINATIONS = 1024
 NUMBERS = 20_000_000
@@ -71,9 +72,10 @@ class Probe:
         self.laws = Laws(model, dtype)
         self.tolerance = tolerance
         pools: dict[str, list[Tensor]] = {}
+        self.worlds, steps = self._affordable(model)
         with seeded(0):
-            worlds = _ProbedWorlds(self.laws, WORLDS)
-            for step in range(STEPS):
+            worlds = _ProbedWorlds(self.laws, self.worlds)
+            for step in range(steps):
                 before = worlds.previous
                 worlds.step({name: self._action(model, name) for name in model.action_names})
                 if step == 3:
@@ -84,8 +86,18 @@ class Probe:
         wanted = worlds.asked_for & set(pools)
         self.pools = {name: self._all_values(model, name, pools[name]) for name in wanted}
 
+    def _affordable(self, model: Any) -> tuple[int, int]:
+        """Return how many worlds are probed over how many steps: fewer, where one of them holds a whole image."""
+        with seeded(0):
+            self.worlds = 2
+            first = _ProbedWorlds(self.laws, self.worlds)
+            first.step({name: self._action(model, name) for name in model.action_names})
+        largest = max(value[0].numel() for value in first.values.values())
+        worlds = max(FEWEST, min(WORLDS, NUMBERS // (len(LINE) * largest)))
+        return worlds, STEPS if worlds == WORLDS else FEWEST
+
     def _action(self, model: Any, name: str) -> Tensor:
-        value = model.space(name).sample((WORLDS,))
+        value = model.space(name).sample((self.worlds,))
         return value.to(self.laws.dtype) if value.is_floating_point() else value
 
     def _all_values(self, model: Any, name: str, found: list[Tensor]) -> Tensor | None:
@@ -159,12 +171,14 @@ class Probe:
         moved = here | {parent.argument: value * (1 + 1e-4) + 1e-4}
         try:
             with torch.no_grad():
-                laws = [self.laws.many(child.name, some, (WORLDS,)) for some in (here, moved)]
+                laws = [self.laws.many(child.name, some, (self.worlds,)) for some in (here, moved)]
         except (ValueOutOfRange, DeclarationError):
             return True
         pairs = zip(tensors(laws[0]), tensors(laws[1]), strict=True)
         # Where next to all worlds stay just as they are, what changes does so in steps.
-        changed = [(a != b).reshape(WORLDS, -1).any(1).double().mean() for a, b in pairs if a.numel() >= WORLDS]
+        changed = [
+            (a != b).reshape(self.worlds, -1).any(1).double().mean() for a, b in pairs if a.numel() >= self.worlds
+        ]
         return not changed or float(max(changed)) > 0.2
 
     def _numel(self, parent: Parent) -> int:
@@ -179,10 +193,10 @@ class Probe:
         drawn = {p.argument: self._value(p) for p in child.parents}
         pools = {p.argument: self.pools[p.name] for p in child.parents if p.argument not in names}
         pools = {name: pool for name, pool in pools.items() if pool is not None and len(pool) > 1}
-        most = max(WORLDS, NUMBERS // (len(LINE) * max(value[0].numel() for value in drawn.values())))
+        most = max(self.worlds, NUMBERS // (len(LINE) * max(value[0].numel() for value in drawn.values())))
         count, picks = _design([len(pool) for pool in pools.values()], min(COMBINATIONS, most))
-        worlds = max(WORLDS, count)
-        tiled = {name: value[torch.arange(worlds) % WORLDS] for name, value in drawn.items()}
+        worlds = max(self.worlds, count)
+        tiled = {name: value[torch.arange(worlds) % self.worlds] for name, value in drawn.items()}
         for (name, pool), pick in zip(pools.items(), picks, strict=True):
             tiled[name] = pool[pick[torch.arange(worlds) % count]].to(drawn[name].dtype)
         return tiled

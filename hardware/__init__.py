@@ -11,6 +11,9 @@ if TYPE_CHECKING:
     from hardware.detectors import Detector as Detector
     from hardware.detectors import LBPDetector as LBPDetector
     from hardware.fovea import Fovea as Fovea
+
+    # Heads.
+    from hardware.panorama_head import PanoramaHead as PanoramaHead
     from hardware.photo import PhotoError as PhotoError
     from hardware.photo import read_photo as read_photo
     from hardware.photo_eye import PhotoEye as PhotoEye
@@ -33,6 +36,8 @@ if TYPE_CHECKING:
 _FILES = {
     "Body": "body",
     "Simulated": "simulated",
+    # Heads.
+    "PanoramaHead": "panorama_head",
     # The digital eye.
     "CascadeDetector": "detectors",
     "Detector": "detectors",

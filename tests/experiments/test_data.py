@@ -201,7 +201,9 @@ def test_an_interrupted_run_goes_on_where_it_stopped(world, name, code):
     (world.place / "dies").write_text("portraits")
     program = "\n".join(
         (
-            "import sys",
+            "import signal, sys",
+            # Where the tests run in the background, interrupts are ignored, and children inherit that.
+            "signal.signal(signal.SIGINT, signal.default_int_handler)",
             "from experiments import data",
             "from experiments.data import Entry",
             "from experiments.data.__main__ import main",

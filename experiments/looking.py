@@ -1,0 +1,159 @@
+"""Learning to look: a head finds out how its own motors work (thesis sections 6.5 and 6.6)."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+import xarray as xr
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+from rich.console import Console
+
+from apmodels import LearningToLook, ValueOutOfRange
+from apmodels.progress import tracked
+from experiments import data
+from experiments.study import Result, remembered
+from inference import RaoBlackwell
+
+# A quick look: seeds, movements.
+QUICK = (2, 25)
+# What counts as known.
+KNOWN = 0.02
+
+
+def two_motors(config: Any, folder: Path, console: Console) -> Result:
+    """Learn two motors; see ``conf/experiment/learning_to_look/two_motors.yaml``."""
+    seeds, movements = QUICK if config.quick else (config.seeds, config.movements)
+    if seeds < 1 or movements < 2 or not 0 < config.reach <= 1 or not config.heads:
+        raise ValueOutOfRange("two_motors needs a head, 1 seed, 2 movements and a reach in (0, 1], or more")
+    panorama = data.files("panorama", "*.jpg")[0]
+    summary: dict[str, float] = {}
+    found = {}
+    for name, settings in config.heads.items():
+        head = instantiate(settings, panorama=str(panorama))
+        parts = []
+        for seed in tracked(range(seeds), f"{name} learns"):
+            setting = [OmegaConf.to_yaml(settings), OmegaConf.to_yaml(config.model), movements, config.reach, seed]
+            make = lambda head=head, seed=seed: learn(  # noqa: E731
+                head, instantiate(config.model, motors=head.motors), movements, config.reach, config.seed + seed
+            )
+            parts.append(remembered(folder, f"{name}_{seed}", setting, make))
+        found[name] = xr.concat(parts, "seed")
+        summary |= _summary(name, found[name])
+        _tell(console, name, summary)
+    return Result(summary, dict(found), {"two_motors": _draw(found)})
+
+
+def learn(head: Any, model: LearningToLook, movements: int, reach: float, seed: int) -> xr.Dataset:
+    """Let a head babble, and learn from what it sees how its motors move it.
+
+    Args:
+        head: a body with ``turn``, ``look``, ``flow``, ``angles`` and ``motors``.
+        model: what it believes of itself.
+        movements: how many.
+        reach: how far from where it began any motor goes, in units.
+        seed: of the commands, and of the head.
+
+    Returns:
+        By ``movement``: ``command``, ``moved`` (what was found; ``truth``: what really was), ``actuation`` (its mean),
+        ``spread`` (its standard deviation), ``seconds``; and ``best``, what least squares make of the true movements.
+    """
+    random = np.random.default_rng(seed)
+    engine = RaoBlackwell(model, particles=1, seed=seed)
+    belief = engine.start()
+    head.reset(seed)
+    place = np.zeros(head.motors)
+    commands, moved, truth, actuation, spread, seconds = [], [], [], [], [], []
+    for movement in range(movements + 1):
+        # The first look is where it is.
+        goal = random.uniform(-reach, reach, head.motors) if movement else place
+        command, before = goal - place, head.angles.copy()
+        place = goal
+        image = head.step(command)
+        begin = time.perf_counter()
+        belief = engine.update(belief, torch.as_tensor(command, dtype=torch.float32), image)
+        seconds.append(time.perf_counter() - begin)
+        law = belief.marginal("actuation")
+        commands.append(command)
+        moved.append(belief.values["motion"][0, 0].numpy())
+        truth.append(head.flow(before, head.angles))
+        actuation.append(law.mean.numpy())
+        spread.append(law.variance.sqrt().numpy())
+    u, m = np.stack(commands)[1:], np.stack(truth)[1:]
+    seen = np.isfinite(m).all(1)
+    best = np.linalg.lstsq(u[seen], m[seen], rcond=None)[0].T
+    by = "movement", "direction", "motor"
+    return xr.Dataset(
+        {
+            "command": (("movement", "motor"), np.stack(commands)),
+            "moved": (("movement", "direction"), np.stack(moved)),
+            "truth": (("movement", "direction"), np.stack(truth)),
+            "actuation": (by, np.stack(actuation)),
+            "spread": (by, np.stack(spread)),
+            "seconds": ("movement", seconds),
+            "best": (("direction", "motor"), best),
+        },
+        coords={"movement": np.arange(movements + 1), "direction": ["horizontal", "vertical"]},
+    )
+
+
+def off(learned: xr.Dataset) -> xr.DataArray:
+    """Return how far what is believed is from the truth, as a share of it, by movement."""
+    wrong = np.sqrt(((learned.actuation - learned.best) ** 2).sum(("direction", "motor")))
+    return wrong / np.sqrt((learned.best**2).sum(("direction", "motor")))
+
+
+def first_within(wrong: np.ndarray, share: float) -> float:
+    """Return after how many movements an error (movements,) is first within a share; NaN if never."""
+    within = np.flatnonzero(wrong <= share)
+    return float(within[0]) if len(within) else np.nan
+
+
+def _summary(name: str, learned: xr.Dataset) -> dict[str, float]:
+    wrong = off(learned)
+    counts = np.array([first_within(wrong.sel(seed=s).values, KNOWN) for s in learned.seed])
+    # The image where a movement was never seen before lies outside the last one; there nothing true is known of it.
+    astray = np.abs(learned.moved - learned.truth).max("direction").values[:, 1:]
+    return {
+        f"{name}.movements": float(np.median(np.where(np.isnan(counts), np.inf, counts))),
+        f"{name}.movements_worst": float(np.max(np.where(np.isnan(counts), np.inf, counts))),
+        f"{name}.last_error": float(wrong.isel(movement=-1).max()),
+        f"{name}.last_error_median": float(wrong.isel(movement=-1).median()),
+        f"{name}.wrong_matches": float(np.mean(astray[np.isfinite(astray)] > 10)),
+        f"{name}.step_ms": float(learned.seconds.isel(movement=slice(1, None)).median()) * 1e3,
+    }
+
+
+def _tell(console: Console, name: str, summary: dict[str, float]) -> None:
+    s = {key.partition(".")[2]: value for key, value in summary.items() if key.startswith(f"{name}.")}
+    console.print(
+        f"{name}: within 2 % of the truth first after {s['movements']:.0f} movements (median; worst "
+        f"{s['movements_worst']:.0f}); in the end {s['last_error_median']:.2%} (median; worst {s['last_error']:.2%}); "
+        f"{s['wrong_matches']:.1%} of movements matched wrongly; {s['step_ms']:.0f} ms a step"
+    )
+
+
+def _draw(found: dict[str, xr.Dataset]) -> Any:
+    figure, axes = plt.subplots(2, len(found), figsize=(5 * len(found), 7), squeeze=False, layout="constrained")
+    for (above, below), (name, learned) in zip(axes.T, found.items(), strict=True):
+        one = learned.isel(seed=0)
+        for d, direction in enumerate(one.direction.values):
+            for k in range(one.sizes["motor"]):
+                colour = f"C{2 * d + k}"
+                mean, spread = (one[v].isel(direction=d, motor=k) for v in ("actuation", "spread"))
+                above.plot(one.movement, mean, color=colour, label=f"motor {k + 1}, {direction}")
+                above.fill_between(one.movement, mean - 2 * spread, mean + 2 * spread, color=colour, alpha=0.2)
+                above.axhline(float(one.best.isel(direction=d, motor=k)), color=colour, ls=":")
+        above.set(title=name, xlabel="movements", ylabel="pixels a unit of command")
+        above.set_ylim(1.6 * float(one.best.min()), 1.6 * float(max(one.best.max(), -0.3 * one.best.min())))
+        above.legend(fontsize=8)
+        below.plot(learned.movement, 100 * off(learned).T, color="0.75", lw=0.8)
+        below.plot(learned.movement, 100 * off(learned).median("seed"), color="C0")
+        below.axhline(100 * KNOWN, color="grey", ls=":")
+        below.set(xlabel="movements", ylabel="error of the gains (%)", yscale="log")
+    return figure
