@@ -77,6 +77,9 @@ class RaoBlackwell(Bank):
         self._swarm: Swarm | None = None
         self.offsets = {d.name: Offsets(self, d) for d in displacements(self.structure, self.plan, self.images)}
         self.sampled_statics = [name for name in self.plan.worlds if name in statics]
+        self.tried = self.candidates
+        if self.offsets and self.chooses and not self.sampled_statics:
+            self.candidates = 1
 
     def divide(self, structure: Structure, given: str | Iterable[str]) -> Plan:
         """Return the plan: what is sampled by rule, and what is sampled by wish."""
@@ -163,7 +166,7 @@ class RaoBlackwell(Bank):
                 step = self.propagate(step, seen)
             except NoTranslation:
                 # The graph would have allowed it, the laws do not: values are tried, as for any other variable.
-                self.offsets = {}
+                self.offsets, self.candidates = {}, self.tried
                 return self.update(before, action, observation)
             weights = belief.log_weights + step.score
             if self.particles == 1:

@@ -33,6 +33,7 @@ class FieldBlock:
         self.states = [name for name in names if roles[name] == "state"]
         self.carried = [name for name in self.states if name in remembered]
         self.group = set(names)
+        self.added: dict[str, Tensor] = {}
 
     def start(self, frame: Frame, befores: dict[str, str | Tensor]) -> Images:
         """Return the images before time began."""
@@ -50,10 +51,7 @@ class FieldBlock:
 
     def step(self, images: Images, frame: Frame, seen: dict[str, Tensor]) -> tuple[Images, Tensor]:
         """Move the images on and condition on what is seen; return the images and the score, (b, n)."""
-        past = dict(images)
-        now = self._now(images)
-        for name in self.states:
-            now[name] = self._moved(name, frame, now, past)
+        now = self.moved(images, frame)
         total = torch.zeros(1, 1, dtype=self.laws.dtype)
         for name in self.seen:
             source = next(p.name for p in self.laws.variables[name].parents if p.name in self.group)
@@ -63,27 +61,30 @@ class FieldBlock:
 
     def imagine(self, images: Images, frame: Frame, lead: tuple[int, int]) -> dict[str, Tensor]:
         """Draw what would be seen after a step, (*lead, *shape) by name."""
-        now = self._now(images)
-        for name in self.states:
-            now[name] = self._moved(name, frame, now, images)
+        now = self.moved(images, frame)
         seen = {}
         for name in self.seen:
-            centre, spread = self._predicted(name, frame, now)
+            centre, spread = self.shown(name, now, frame)
             seen[name] = centre + spread.sqrt() * torch.randn(*lead, *centre.shape[2:], dtype=centre.dtype)
         return seen
 
     def predicted(self, name: str, images: Images, frame: Frame) -> tuple[Tensor, Tensor]:
         """Return the mean and the variance of what would be seen after a step."""
+        return self.shown(name, self.moved(images, frame), frame)
+
+    def moved(self, images: Images, frame: Frame) -> Images:
+        """Return the images after a step, before anything is seen of them."""
         now = self._now(images)
-        for other in self.states:
-            now[other] = self._moved(other, frame, now, images)
-        return self._predicted(name, frame, now)
+        for name in self.states:
+            now[name] = self._moved(name, frame, now, images)
+        return now
 
     def _now(self, images: Images) -> Images:
         """What of the last step is still there in this one."""
         return {} if self.states else {name: images[name] for name in self.statics}
 
-    def _predicted(self, name: str, frame: Frame, now: Images) -> tuple[Tensor, Tensor]:
+    def shown(self, name: str, now: Images, frame: Frame) -> tuple[Tensor, Tensor]:
+        """Return the mean and the variance of an observation of images."""
         source = next(p.name for p in self.laws.variables[name].parents if p.name in self.group)
         mean, variance = now[source]
         centre, noise = self._law(name, frame, mean)
@@ -111,15 +112,24 @@ class FieldBlock:
             return self._law(name, frame, None)
         mean, variance = (past if source.lag else now)[source.name]
         centre, noise = self._law(name, frame, mean)
-        nothing, _ = self._law(name, frame, torch.zeros_like(mean))
         spread, _ = self._law(name, frame, variance)
-        return centre, spread - nothing + noise
+        return centre, spread + self._added(name, frame, mean, noise)
+
+    def _added(self, name: str, frame: Frame, mean: Tensor, noise: Tensor) -> Tensor:
+        """The noise that a law adds, less what it makes of an image that is zero; once, if nothing else bears on it."""
+        if name in self.added:
+            return self.added[name]
+        nothing, _ = self._law(name, frame, torch.zeros_like(mean))
+        added = noise - nothing
+        if all(p.name in self.group for p in self.laws.variables[name].parents) and not added.requires_grad:
+            self.added[name] = added[:1, :1]
+        return added
 
     def _seen(
         self, name: str, source: str, frame: Frame, image: tuple[Tensor, Tensor], value: Tensor
     ) -> tuple[tuple[Tensor, Tensor], Tensor]:
         mean, variance = image
-        centre, spread = self._predicted(name, frame, {source: image})
+        centre, spread = self.shown(name, {source: image}, frame)
         lead = torch.broadcast_shapes(centre.shape[:2], value.shape[:2])
         missing = torch.isnan(value)
         surprise = torch.where(missing, 0.0, value - centre)

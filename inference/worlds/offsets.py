@@ -18,7 +18,7 @@ from inference.worlds.gaussian import Gaussian
 from inference.worlds.plan import Plan
 
 # A displacement is looked for within so many of its standard deviations.
-REACH = 4.0
+REACH = 2.5
 # Coordinates begin here, so that what comes in from outside is told from what has a place.
 FAR = 10_000.0
 
@@ -92,6 +92,10 @@ class Offsets:
         self.bank, self.block = bank, bank.images[displacement.field]
         self.name, self.seen, self.field = displacement.name, displacement.seen, displacement.field
         self.outside: tuple[float, float] | None = None
+        # Whether the image moves, if at all, in the same way at every step; then coordinates are moved once.
+        parents = [p for state in self.block.states for p in bank.laws.variables[state].parents]
+        self.still = all(p.name in self.block.group for p in parents)
+        self.moved: dict[Any, Images] = {}
         self.sign = 0
 
     def choose(self, step: Any, prior: Gaussian, seen: Values, best: bool) -> tuple[Tensor, Tensor, Tensor]:
@@ -103,20 +107,21 @@ class Offsets:
         mean = prior.mean.expand(*step.lead, 2).double()
         # Of a whole pixel: the density in its middle, were the value spread by as much as a pixel is.
         covariance = prior.covariance.expand(*step.lead, 2, 2).double() + torch.eye(2, dtype=torch.float64) / 12
-        joint, log_prior, pixels = self._lattice(step, mean, covariance, seen[self.seen])
+        joint, log_prior, (near, across, down) = self._lattice(step, mean, covariance, seen[self.seen])
         total = joint.logsumexp(-1, keepdim=True)
         if best:
             at = joint.argmax(-1, keepdim=True)
         else:
             at = torch.distributions.Categorical(logits=joint - total, validate_args=False).sample()[..., None]
-        value = pixels.gather(2, at[..., None].expand(*at.shape, 2))[:, :, 0]
+        row, column = at[..., 0] // len(across), at[..., 0] % len(across)
+        value = near + torch.stack([across[column], down[row]], -1)
         if not best:
             value = value + torch.rand(value.shape, dtype=value.dtype) - 0.5
         chosen, expected = (joint - total).gather(-1, at), log_prior.gather(-1, at)
         return tuple(part.to(self.bank.dtype) for part in (value, chosen[..., 0], expected[..., 0]))  # type: ignore
 
-    def _lattice(self, step: Any, mean: Tensor, covariance: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """log p(pixel, image), log p(pixel), (rows, worlds, pixels), and the pixels, (rows, worlds, pixels, 2)."""
+    def _lattice(self, step: Any, mean: Tensor, covariance: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Any]:
+        """log p(pixel, image) and log p(pixel), (rows, worlds, pixels), row by row; and where the pixels are."""
         images = step.fields[self.field]
         field_mean, field_variance = images[next(iter(images)) if len(images) == 1 else self.block.carried[0]]
         near, reach = mean.round(), self._reach(covariance, field_mean.shape[-2:])
@@ -126,11 +131,13 @@ class Offsets:
             # What moves to the right was further left before.
             scores = scores.flip(-2, -1)
         across, down = (torch.arange(-n, n + 1, dtype=torch.float64) for n in reach)
-        pixels = near[:, :, None] + torch.stack(torch.meshgrid(across, down, indexing="xy"), -1).flatten(0, 1)
-        zero = torch.zeros(2, dtype=torch.float64)
-        law = torch.distributions.MultivariateNormal(zero, covariance[:, :, None], validate_args=False)
-        log_prior = law.log_prob(pixels - mean[:, :, None])
-        return scores.flatten(2).double() + log_prior, log_prior, pixels
+        apart = near - mean
+        x, y = (apart[..., 0, None] + across)[..., None, :], (apart[..., 1, None] + down)[..., :, None]
+        precision = torch.linalg.inv(covariance)[..., None, None]
+        square = precision[..., 0, 0, :, :] * x * x + precision[..., 1, 1, :, :] * y * y
+        square = square + 2 * precision[..., 0, 1, :, :] * x * y
+        log_prior = -0.5 * (square + (covariance.logdet() + 2 * math.log(2 * math.pi))[..., None, None])
+        return (scores.double() + log_prior).flatten(2), log_prior.flatten(2), (near, across, down)
 
     def _reach(self, covariance: Tensor, shape: Any) -> tuple[int, int]:
         """How far to look, (columns, rows): the uncertainty says, and no farther than the image is large."""
@@ -146,7 +153,12 @@ class Offsets:
             if bank.roles[name] == "state":
                 keys = [(p.name, p.lag) for p in bank.laws.variables[name].parents]
                 frame.values[name, 0] = frame.in_all(bank.laws, name, frame.lead(keys))  # type: ignore[assignment]
-        return self.block.predicted(self.seen, self._images(step, mean), frame)
+        if not self.still:
+            return self.block.predicted(self.seen, self._images(step, mean), frame)
+        key = ("row" if mean[0, 0] != mean[-1, 0] else "column") if isinstance(mean, Tensor) else mean
+        if key not in self.moved:
+            self.moved[key] = self.block.moved(self._images(step, mean), frame)
+        return self.block.shown(self.seen, self.moved[key], frame)
 
     def _images(self, step: Any, mean: Tensor | float) -> Images:
         """The block's images, had they this mean and no variance."""

@@ -123,7 +123,7 @@ def test_particles_agree_with_blind_ones():
     blind = []
     for seed in range(8):
         engine = RaoBlackwell(model, particles=4000, seed=seed)
-        engine.offsets = {}
+        engine.offsets, engine.candidates = {}, engine.tried
         blind.append(engine.filter(commands, images)[-1])
     for ask in (lambda b: b.log_evidence, lambda b: b.marginal("actuation").mean.flatten()[:2]):
         ours, theirs = (torch.stack([ask(b) for b in some]) for some in (looking, blind))
