@@ -63,7 +63,8 @@ class PanoramaHead:
         wanted = 360 / math.degrees(1 / self.focal)
         share = min(1.0, 1.2 * wanted / grey.shape[1])
         self.panorama = cv2.resize(grey, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
-        self.rays = self._rays(math.radians(roll), distortion)
+        self.roll, self.distortion = math.radians(roll), distortion
+        self.rays = self._rays()
         self.reset(0)
 
     @property
@@ -113,24 +114,33 @@ class PanoramaHead:
 
     def flow(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """Return how far what is seen moves between angles, (horizontal, vertical) pixels: the mean where both see."""
-        rows, columns = self.size
         # Where the rays of the image before are in the image after.
         camera = self.rays @ (_turned(*np.radians(before)).T @ _turned(*np.radians(after))).astype(np.float32)
-        there = camera[..., :2] / camera[..., 2:] * self.focal
-        plain = self.rays[..., :2] / self.rays[..., 2:] * self.focal
-        moved = (there - plain) * np.array([1.0, -1.0])
-        inside = (np.abs(there[..., 0]) < columns / 2) & (np.abs(there[..., 1]) < rows / 2) & (camera[..., 2] > 0)
+        moved = self._pixels(camera) - self._pixels(self.rays)
+        there = self._pixels(camera) + (np.array(self.size[::-1]) - 1) / 2
+        inside = ((there >= 0) & (there <= np.array(self.size[::-1]) - 1)).all(-1) & (camera[..., 2] > 0)
         return moved[inside].mean(0) if inside.any() else np.full(2, np.nan)
 
-    def _rays(self, roll: float, distortion: float) -> np.ndarray:
+    def _pixels(self, directions: np.ndarray) -> np.ndarray:
+        """Where directions (right, up, ahead) are seen, (right, down) of the image's middle, pixels."""
+        flat = directions[..., :2].astype(float) / directions[..., 2:] * self.focal
+        c, s = math.cos(self.roll), math.sin(self.roll)
+        x, y = flat[..., 0] * c + flat[..., 1] * s, flat[..., 1] * c - flat[..., 0] * s
+        corner, shrunk = (self.size[0] ** 2 + self.size[1] ** 2) / 4, np.ones_like(x)
+        for _ in range(20):
+            shrunk = 1 - self.distortion * np.minimum((x**2 + y**2) * shrunk**2 / corner, 1.5)
+        return np.stack([x * shrunk, -y * shrunk], -1)
+
+    def _rays(self) -> np.ndarray:
         """Directions (right, up, ahead) of all pixels, (rows, columns, 3)."""
         rows, columns = self.size
         y, x = np.mgrid[:rows, :columns].astype(float)
         x, y = x - (columns - 1) / 2, (rows - 1) / 2 - y
         corner = (columns**2 + rows**2) / 4
-        stretch = 1 / (1 - distortion * (x**2 + y**2) / corner)
+        stretch = 1 / (1 - self.distortion * (x**2 + y**2) / corner)
         x, y = x * stretch, y * stretch
-        x, y = x * math.cos(roll) - y * math.sin(roll), x * math.sin(roll) + y * math.cos(roll)
+        c, s = math.cos(self.roll), math.sin(self.roll)
+        x, y = x * c - y * s, x * s + y * c
         rays = np.stack([x, y, np.full_like(x, self.focal)], -1)
         return (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
 

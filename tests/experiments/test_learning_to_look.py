@@ -2,8 +2,13 @@
 
 import json
 
+import cv2
+import numpy as np
 import pytest
 
+from apmodels import LearningToLook
+from experiments.looking import first_within, learn, off
+from hardware import PanoramaHead
 from tests.experiments.test_cli import apmodels, one_sentence
 
 
@@ -19,4 +24,39 @@ def test_human_data(tmp_path):
     assert found["head.inf"] == 0 and found["restrained.1"] == pytest.approx(0.04, abs=1e-3)
     assert "49.48 (49.48)" in said and (tmp_path / "run/human_data.png").stat().st_size > 10_000
     code, _, complaint = apmodels(tmp_path, "experiment=learning_to_look/human_data", "heads=[0]")
+    assert code == 2 and one_sentence(complaint)
+
+
+def scenery(height=500):
+    """A panorama that is as detailed as photographs are, coarse and fine."""
+    random = np.random.default_rng(0)
+    image = np.zeros((height, 2 * height), np.float32)
+    for cells in (8, 20, 50):
+        coarse = random.normal(size=(cells, 2 * cells)).astype(np.float32)
+        image += cv2.resize(coarse, (2 * height, height), interpolation=cv2.INTER_CUBIC)
+    return np.clip(127 + 60 * image, 0, 255).astype(np.uint8)
+
+
+def test_a_head_learns_what_its_motors_do():
+    head = PanoramaHead(scenery(), size=(60, 80), slip=1.0, gains=((60, 5), (-4, 40)), roll=2.0)
+    model = LearningToLook(view=(60, 80), field=(180, 240), slip=5.0)
+    learned = learn(head, model, movements=16, reach=0.4, seed=3)
+    assert learned.sizes == {"movement": 17, "motor": 2, "direction": 2}
+    # What is found is what really was, to a pixel or two.
+    astray = np.abs(learned.moved - learned.truth).max("direction").values[1:]
+    assert np.nanmean(astray < 3) > 0.9
+    wrong = off(learned).values
+    assert wrong[0] == 1 and wrong[-1] < 0.05
+    again = learn(head, model, movements=3, reach=0.4, seed=3)
+    assert again.actuation.equals(learned.actuation.isel(movement=slice(4)))
+
+
+def test_when_an_error_is_small_for_the_first_time():
+    assert first_within(np.array([1.0, 0.03, 0.02, 0.05]), 0.02) == 2
+    assert np.isnan(first_within(np.array([1.0, 0.03]), 0.02))
+
+
+@pytest.mark.parametrize("words", [["seeds=0"], ["reach=2"], ["movements=1"]])
+def test_bad_two_motors(tmp_path, words):
+    code, _, complaint = apmodels(tmp_path, "experiment=learning_to_look/two_motors", *words)
     assert code == 2 and one_sentence(complaint)
