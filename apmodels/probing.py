@@ -28,6 +28,7 @@ FEWEST = 5
 # How many combinations of finite values, and how many numbers, one probe may look at.
 COMBINATIONS = 1024
 NUMBERS = 20_000_000
+IMAGES = 1_000_000  # numbers of one variable in all worlds; of a larger one fewer worlds are probed
 # Where on the line through two worlds (0 and 1) a law is evaluated.
 LINE = (0.0, 1.0, 0.37, -1.0, 2.6, -4.3, 11.0, -23.0, 61.0)
 
@@ -92,8 +93,7 @@ class Probe:
             self.worlds = 2
             first = _ProbedWorlds(self.laws, self.worlds)
             first.step({name: self._action(model, name) for name in model.action_names})
-        largest = max(value[0].numel() for value in first.values.values())
-        worlds = max(FEWEST, min(WORLDS, NUMBERS // (len(LINE) * largest)))
+        worlds = max(FEWEST, min(WORLDS, IMAGES // max(value[0].numel() for value in first.values.values())))
         return worlds, STEPS if worlds == WORLDS else FEWEST
 
     def _action(self, model: Any, name: str) -> Tensor:
@@ -154,7 +154,7 @@ class Probe:
             sets = sorted(itertools.combinations(rest, count), key=lambda some: sum(map(self._numel, some)))
             for some in sets:
                 kept = [p for p in rest if p not in some]
-                if not kept or self._is_affine(child, kept):
+                if len(kept) < 2 or self._is_affine(child, kept):
                     given = [p.argument for p in continuous if p not in kept]
                     for p in some:
                         kinds[p.argument] = ("nonlinear", f"multiplies {', '.join(q.argument for q in kept)}")

@@ -14,7 +14,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from rich.console import Console
 
-from apmodels import LearningToLook, ValueOutOfRange
+from apmodels import ValueOutOfRange
 from apmodels.progress import tracked
 from experiments import data
 from experiments.study import Result, remembered
@@ -36,12 +36,11 @@ def two_motors(config: Any, folder: Path, console: Console) -> Result:
     found = {}
     for name, settings in config.heads.items():
         head = instantiate(settings, panorama=str(panorama))
+        engine = RaoBlackwell(instantiate(config.model, motors=head.motors), particles=1)
         parts = []
         for seed in tracked(range(seeds), f"{name} learns"):
             setting = [OmegaConf.to_yaml(settings), OmegaConf.to_yaml(config.model), movements, config.reach, seed]
-            make = lambda head=head, seed=seed: learn(  # noqa: E731
-                head, instantiate(config.model, motors=head.motors), movements, config.reach, config.seed + seed
-            )
+            make = lambda h=head, e=engine, s=seed: learn(h, e, movements, config.reach, config.seed + s)  # noqa: E731
             parts.append(remembered(folder, f"{name}_{seed}", setting, make))
         found[name] = xr.concat(parts, "seed")
         summary |= _summary(name, found[name])
@@ -49,12 +48,12 @@ def two_motors(config: Any, folder: Path, console: Console) -> Result:
     return Result(summary, dict(found), {"two_motors": _draw(found)})
 
 
-def learn(head: Any, model: LearningToLook, movements: int, reach: float, seed: int) -> xr.Dataset:
+def learn(head: Any, engine: Any, movements: int, reach: float, seed: int) -> xr.Dataset:
     """Let a head babble, and learn from what it sees how its motors move it.
 
     Args:
         head: a body with ``turn``, ``look``, ``flow``, ``angles`` and ``motors``.
-        model: what it believes of itself.
+        engine: of a ``LearningToLook``: what the head believes of itself.
         movements: how many.
         reach: how far from where it began any motor goes, in units.
         seed: of the commands, and of the head.
@@ -64,7 +63,6 @@ def learn(head: Any, model: LearningToLook, movements: int, reach: float, seed: 
         ``spread`` (its standard deviation), ``seconds``; and ``best``, what least squares make of the true movements.
     """
     random = np.random.default_rng(seed)
-    engine = RaoBlackwell(model, particles=1, seed=seed)
     belief = engine.start()
     head.reset(seed)
     place = np.zeros(head.motors)

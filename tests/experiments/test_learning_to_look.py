@@ -9,6 +9,7 @@ import pytest
 from apmodels import LearningToLook
 from experiments.looking import first_within, learn, off
 from hardware import PanoramaHead
+from inference import RaoBlackwell
 from tests.experiments.test_cli import apmodels, one_sentence
 
 
@@ -39,15 +40,15 @@ def scenery(height=500):
 
 def test_a_head_learns_what_its_motors_do():
     head = PanoramaHead(scenery(), size=(60, 80), slip=1.0, gains=((60, 5), (-4, 40)), roll=2.0)
-    model = LearningToLook(view=(60, 80), field=(180, 240), slip=5.0)
-    learned = learn(head, model, movements=16, reach=0.4, seed=3)
+    engine = RaoBlackwell(LearningToLook(view=(60, 80), field=(180, 240), slip=5.0), particles=1)
+    learned = learn(head, engine, movements=16, reach=0.4, seed=3)
     assert learned.sizes == {"movement": 17, "motor": 2, "direction": 2}
     # What is found is what really was, to a pixel or two.
     astray = np.abs(learned.moved - learned.truth).max("direction").values[1:]
     assert np.nanmean(astray < 3) > 0.9
     wrong = off(learned).values
     assert wrong[0] == 1 and wrong[-1] < 0.05
-    again = learn(head, model, movements=3, reach=0.4, seed=3)
+    again = learn(head, engine, movements=3, reach=0.4, seed=3)
     assert again.actuation.equals(learned.actuation.isel(movement=slice(4)))
 
 
