@@ -16,6 +16,7 @@ from rich.console import Console
 
 from apmodels import ValueOutOfRange
 from apmodels.progress import tracked
+from controllers.gaze_shift import gaze_shift
 from experiments import data
 from experiments.study import Result, remembered
 from inference import RaoBlackwell
@@ -24,6 +25,8 @@ from inference import RaoBlackwell
 QUICK = (2, 25)
 # What counts as known.
 KNOWN = 0.02
+# Targets looked at after learning.
+FIXATIONS = 50
 
 
 def two_motors(config: Any, folder: Path, console: Console) -> Result:
@@ -45,6 +48,7 @@ def two_motors(config: Any, folder: Path, console: Console) -> Result:
         found[name] = xr.concat(parts, "seed")
         summary |= _summary(name, found[name])
         _tell(console, name, summary)
+    summary["fixation_error"] = max(summary[f"{name}.fixation_error"] for name in found)
     return Result(summary, dict(found), {"two_motors": _draw(found)})
 
 
@@ -60,7 +64,9 @@ def learn(head: Any, engine: Any, movements: int, reach: float, seed: int) -> xr
 
     Returns:
         By ``movement``: ``command``, ``moved`` (what was found; ``truth``: what really was), ``actuation`` (its mean),
-        ``spread`` (its standard deviation), ``seconds``; and ``best``, what least squares make of the true movements.
+        ``spread`` (its standard deviation), ``seconds``; ``best``, what least squares make of the true movements; and
+        ``missed``, by ``fixation``: how far from the middle a target comes that is looked at after learning, as a share
+        of the image's width, without the motors' own noise.
     """
     random = np.random.default_rng(seed)
     belief = engine.start()
@@ -82,6 +88,7 @@ def learn(head: Any, engine: Any, movements: int, reach: float, seed: int) -> xr
         truth.append(head.flow(before, head.angles))
         actuation.append(law.mean.numpy())
         spread.append(law.variance.sqrt().numpy())
+    missed = _fixations(head, actuation[-1], random)
     u, m = np.stack(commands)[1:], np.stack(truth)[1:]
     seen = np.isfinite(m).all(1)
     best = np.linalg.lstsq(u[seen], m[seen], rcond=None)[0].T
@@ -95,9 +102,25 @@ def learn(head: Any, engine: Any, movements: int, reach: float, seed: int) -> xr
             "spread": (by, np.stack(spread)),
             "seconds": ("movement", seconds),
             "best": (("direction", "motor"), best),
+            "missed": ("fixation", missed),
         },
         coords={"movement": np.arange(movements + 1), "direction": ["horizontal", "vertical"]},
     )
+
+
+def _fixations(head: Any, actuation: np.ndarray, random: np.random.Generator) -> list[float]:
+    """Look at things that are seen anywhere in the image, from the middle of all that can be seen."""
+    slip, head.slip, missed = head.slip, 0.0, []
+    half = (np.array(head.size[::-1]) - 1) / 2
+    for _ in range(FIXATIONS):
+        head.angles = np.zeros(2)
+        target = random.uniform(-0.9, 0.9, 2) * half
+        # What is to be seen in the middle must move there.
+        command = gaze_shift(torch.as_tensor(actuation), torch.zeros(actuation.shape), torch.as_tensor(-target))
+        head.turn(command.numpy())
+        missed.append(float(np.hypot(*head.follow(target, np.zeros(2), head.angles))) / head.size[1])
+    head.slip = slip
+    return missed
 
 
 def off(learned: xr.Dataset) -> xr.DataArray:
@@ -123,6 +146,7 @@ def _summary(name: str, learned: xr.Dataset) -> dict[str, float]:
         f"{name}.last_error": float(wrong.isel(movement=-1).max()),
         f"{name}.last_error_median": float(wrong.isel(movement=-1).median()),
         f"{name}.wrong_matches": float(np.mean(astray[np.isfinite(astray)] > 10)),
+        f"{name}.fixation_error": float(learned.missed.median()),
         f"{name}.step_ms": float(learned.seconds.isel(movement=slice(1, None)).median()) * 1e3,
     }
 
@@ -132,7 +156,8 @@ def _tell(console: Console, name: str, summary: dict[str, float]) -> None:
     console.print(
         f"{name}: within 2 % of the truth first after {s['movements']:.0f} movements (median; worst "
         f"{s['movements_worst']:.0f}); in the end {s['last_error_median']:.2%} (median; worst {s['last_error']:.2%}); "
-        f"{s['wrong_matches']:.1%} of movements matched wrongly; {s['step_ms']:.0f} ms a step"
+        f"{s['wrong_matches']:.1%} of movements matched wrongly; what is looked at then comes within "
+        f"{s['fixation_error']:.2%} of the image's width (median); {s['step_ms']:.0f} ms a step"
     )
 
 

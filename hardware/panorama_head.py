@@ -121,6 +121,12 @@ class PanoramaHead:
         inside = ((there >= 0) & (there <= np.array(self.size[::-1]) - 1)).all(-1) & (camera[..., 2] > 0)
         return moved[inside].mean(0) if inside.any() else np.full(2, np.nan)
 
+    def follow(self, pixel: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """Return where what was seen at a pixel, (right, down) of the middle, is seen after a turn between angles."""
+        row, column = (np.asarray(pixel)[::-1] + (np.array(self.size) - 1) / 2).round().astype(int)
+        turn = _turned(*np.radians(before)).T @ _turned(*np.radians(after))
+        return self._pixels(self.rays[row, column] @ turn)
+
     def _pixels(self, directions: np.ndarray) -> np.ndarray:
         """Where directions (right, up, ahead) are seen, (right, down) of the image's middle, pixels."""
         flat = directions[..., :2].astype(float) / directions[..., 2:] * self.focal

@@ -42,7 +42,8 @@ def test_a_head_learns_what_its_motors_do():
     head = PanoramaHead(scenery(), size=(60, 80), slip=1.0, gains=((60, 5), (-4, 40)), roll=2.0)
     engine = RaoBlackwell(LearningToLook(view=(60, 80), field=(180, 240), slip=5.0), particles=1)
     learned = learn(head, engine, movements=16, reach=0.4, seed=3)
-    assert learned.sizes == {"movement": 17, "motor": 2, "direction": 2}
+    assert learned.sizes == {"movement": 17, "motor": 2, "direction": 2, "fixation": 50}
+    assert learned.missed.median() < 0.05
     # What is found is what really was, to a pixel or two.
     astray = np.abs(learned.moved - learned.truth).max("direction").values[1:]
     assert np.nanmean(astray < 3) > 0.9

@@ -42,6 +42,18 @@ def test_what_is_seen_moves_as_is_said(settings, turn):
     assert np.abs(np.array(found) - expected).max() < 1.5
 
 
+def test_what_is_followed_is_where_it_is_seen():
+    eye = head(roll=5.0, distortion=0.05)
+    before, after = np.array([2.0, -1.0]), np.array([6.0, 2.0])
+    first, second = eye.render(before), eye.render(after)
+    patch = first[50:70, 90:110]
+    score = cv2.matchTemplate(second, patch, cv2.TM_CCOEFF_NORMED)
+    row, column = np.unravel_index(score.argmax(), score.shape)
+    found = np.array([column, row]) + 9.5 - np.array([79.5, 59.5])
+    expected = eye.follow(np.array([99.5 - 79.5, 59.5 - 59.5]), before, after)
+    assert np.abs(found - expected).max() < 1.5
+
+
 def test_motors_add_up_and_stop_at_their_limits():
     eye = head(gains=((10.0, 5.0, 0.0), (0.0, 2.0, -20.0)), limits=(12.0, 30.0))
     eye.step(torch.tensor([0.5, 1.0, 0.25]))
