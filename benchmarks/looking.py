@@ -74,7 +74,9 @@ def _step() -> dict[str, float]:
 def _shifts() -> dict[str, float]:
     """How often the shift between two crops of the panorama is found to two pixels, by how large it is."""
     scene, random = _head().panorama / np.float32(255), np.random.default_rng(1)
-    engine = RaoBlackwell(LearningToLook(view=VIEW, field=FIELD, gain=1.0, wear=0.1, slip=90.0, noise=0.05), particles=1)
+    engine = RaoBlackwell(
+        LearningToLook(view=VIEW, field=FIELD, gain=1.0, wear=0.1, slip=90.0, noise=0.05), particles=1
+    )
     window = cv2.createHanningWindow(VIEW[::-1], cv2.CV_64F)
     # Neither sky nor ground alone: from 40 degrees above the horizon to 40 below.
     middle = np.array([0.28, 0.72]) * scene.shape[0]

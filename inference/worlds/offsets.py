@@ -95,7 +95,7 @@ class Offsets:
         # Whether the image moves, if at all, in the same way at every step; then coordinates are moved once.
         parents = [p for state in self.block.states for p in bank.laws.variables[state].parents]
         self.still = all(p.name in self.block.group for p in parents)
-        self.moved: dict[Any, Images] = {}
+        self.moved: Images | None = None
         self.sign = 0
 
     def choose(self, step: Any, prior: Gaussian, seen: Values, best: bool) -> tuple[Tensor, Tensor, Tensor]:
@@ -144,8 +144,8 @@ class Offsets:
         far = (REACH * covariance.diagonal(dim1=-2, dim2=-1).sqrt()).amax((0, 1)).ceil() + 1
         return min(int(far[0]), int(shape[-1])), min(int(far[1]), int(shape[-2]))
 
-    def _predicted(self, step: Any, value: Tensor, mean: Tensor | float) -> tuple[Tensor, Tensor]:
-        """What would be seen, mean and variance, had the displacement this value and the image this certain mean."""
+    def _predicted(self, step: Any, value: Tensor) -> tuple[Tensor, Tensor]:
+        """What would be seen, mean and variance, had the displacement this value and the image its own coordinates."""
         bank, values = self.bank, dict(step.frame.values)
         values[self.name, 0] = value
         frame = Frame(values)
@@ -153,66 +153,57 @@ class Offsets:
             if bank.roles[name] == "state":
                 keys = [(p.name, p.lag) for p in bank.laws.variables[name].parents]
                 frame.values[name, 0] = frame.in_all(bank.laws, name, frame.lead(keys))  # type: ignore[assignment]
-        if not self.still:
-            return self.block.predicted(self.seen, self._images(step, mean), frame)
-        key = ("row" if mean[0, 0] != mean[-1, 0] else "column") if isinstance(mean, Tensor) else mean
-        if key not in self.moved:
-            self.moved[key] = self.block.moved(self._images(step, mean), frame)
-        return self.block.shown(self.seen, self.moved[key], frame)
+        if not self.still or self.moved is None:
+            self.moved = self.block.moved(self._coordinates(step), frame)
+        return self.block.shown(self.seen, self.moved, frame)
 
-    def _images(self, step: Any, mean: Tensor | float) -> Images:
-        """The block's images, had they this mean and no variance."""
+    def _coordinates(self, step: Any) -> Images:
+        """Images of pixels' numbers, row by row, of which all are certain."""
         images: Images = {}
         for name, (old, _) in step.fields[self.field].items():
-            image = torch.as_tensor(mean, dtype=old.dtype).expand(1, 1, *old.shape[2:])
-            images[name] = image, torch.zeros_like(image)
+            if old.shape[2:].numel() + FAR > 1 / torch.finfo(old.dtype).eps:
+                raise NoTranslation(f"{name} has more pixels than can be numbered")
+            numbers = torch.arange(old.shape[2:].numel(), dtype=old.dtype).reshape(1, 1, *old.shape[2:]) + FAR
+            images[name] = numbers, torch.zeros_like(numbers)
         return images
 
-    def _corner(self, step: Any, value: Tensor, shape: Any) -> Tensor:
-        """The place in the image, (rows, worlds, 2) as (row, column), of the upper left pixel of what is seen."""
+    def _base(self, step: Any, value: Tensor, shape: Any) -> tuple[Tensor, float]:
+        """Where what is seen begins in the image, (rows, worlds, 2) as (row, column), and the noise on the way."""
+        corner, noise = self._corner(step, value, shape)
+        if self.outside is None:
+            self._learn(step, value, corner, shape)
+        return corner, noise
+
+    def _corner(self, step: Any, value: Tensor, shape: Any) -> tuple[Tensor, float]:
+        centre, spread = self._predicted(step, value)
+        inside, number = centre >= FAR - 0.5, (centre - FAR).round().long()
+        if not bool(inside.flatten(2).any(-1).all()):
+            raise NoTranslation(f"nothing is seen of the image where {self.name} is {value.flatten(0, 1)[0].tolist()}")
         found = []
-        for axis in (0, 1):
-            line = torch.arange(shape[axis], dtype=self.bank.dtype) + FAR
-            coordinates = (line[:, None] if axis == 0 else line).expand(*shape)
-            centre, _ = self._predicted(step, value, coordinates)
-            size = centre.shape[2 + axis]
-            steps = torch.arange(size, dtype=centre.dtype)
-            origin = centre - FAR - (steps[:, None] if axis == 0 else steps)
-            inside = centre >= FAR - 1
-            if not bool(inside.flatten(2).any(-1).all()):
-                raise NoTranslation(
-                    f"nothing is seen of the image where {self.name} is {value.flatten(0, 1)[0].tolist()}"
-                )
-            low = torch.where(inside, origin, torch.inf).amin((-2, -1))
-            high = torch.where(inside, origin, -torch.inf).amax((-2, -1))
+        for axis, place in enumerate((number // shape[1], number % shape[1])):
+            line = torch.arange(centre.shape[2 + axis])
+            origin = place - (line[:, None] if axis == 0 else line)
+            low = torch.where(inside, origin, shape[axis] + 1).amin((-2, -1))
+            high = torch.where(inside, origin, -centre.shape[2 + axis] - 1).amax((-2, -1))
             if not torch.equal(low, high):
                 raise NoTranslation(f"{self.name} does more to {self.seen} than to move it")
             found.append(low)
-        return torch.stack(found, -1).expand(*step.lead, 2)
-
-    def _base(self, step: Any, near: Tensor, shape: Any) -> tuple[Tensor, float]:
-        """Where what is seen begins in the image, (rows, worlds, 2), and the variance of the noise on the way there."""
-        base = self._corner(step, near, shape)
-        centre, spread = self._predicted(step, near, FAR)
-        inside = centre >= FAR - 1
-        noise = spread[inside.expand_as(spread)]
-        if self.outside is None:
-            self._learn(step, near, base, shape)
-        if bool((noise != noise[0]).any()):
+        least, most = torch.aminmax(spread[inside.expand_as(spread)])
+        if least != most:
             raise NoTranslation(f"the noise of {self.seen} is not the same in all of it")
-        return base, float(noise[0])
+        return torch.stack(found, -1).expand(*step.lead, 2), float(least)
 
     def _learn(self, step: Any, near: Tensor, base: Tensor, shape: Any) -> None:
         """Find out which way the displacement moves the image, and what comes in from outside."""
         moved = torch.tensor([3.0, -2.0], dtype=near.dtype)
-        change = self._corner(step, near + moved, shape) - base
+        change = self._corner(step, near + moved, shape)[0] - base
         for sign in (1, -1):
             if bool((change == -sign * moved.flip(0)).all()):
                 self.sign = sign
         if not self.sign:
             raise NoTranslation(f"{self.name} does not move {self.seen} by whole pixels")
-        centre, spread = self._predicted(step, near + 10 * FAR, FAR)
-        if bool((centre >= FAR - 1).any()) or bool((centre != centre.flatten()[0]).any()):
+        centre, spread = self._predicted(step, near + 10 * FAR)
+        if bool((centre >= FAR - 0.5).any()) or bool((centre != centre.flatten()[0]).any()):
             raise NoTranslation(f"what comes into {self.seen} from outside is not all alike")
         self.outside = float(centre.flatten()[0]), float(spread.flatten()[0])
 
@@ -224,8 +215,8 @@ class Offsets:
         height, width = mean.shape[-2:]
         size = self.bank.structure.nodes[self.seen].shape
         across, down = reach
-        rows = (base[..., 0].long() - down)[..., None] + torch.arange(size[0] + 2 * down)
-        columns = (base[..., 1].long() - across)[..., None] + torch.arange(size[1] + 2 * across)
+        rows = (base[..., 0] - down)[..., None] + torch.arange(size[0] + 2 * down)
+        columns = (base[..., 1] - across)[..., None] + torch.arange(size[1] + 2 * across)
         inside = ((rows >= 0) & (rows < height))[..., :, None] & ((columns >= 0) & (columns < width))[..., None, :]
         at = rows.clamp(0, height - 1)[..., :, None] * width + columns.clamp(0, width - 1)[..., None, :]
         parts = []
