@@ -9,7 +9,7 @@ from torch import Tensor
 from apmodels.errors import ValueOutOfRange
 from apmodels.model import Model
 from apmodels.spaces import Box
-from apmodels.transforms import ones, shift, window, zeros
+from apmodels.transforms import ones, shift, where, window, zeros
 from apmodels.variables import action, observation, state, static
 
 
@@ -86,9 +86,14 @@ class LearningToLook(Model):
     def image(self, scene, gaze):
         """What the camera sees (eq. 6.22); what lies outside the scene is as unknown as all was at first."""
         corner = self.middle() - gaze
-        outside = 1 - window(ones(*self.field), corner, self.view)
-        spread = (self.noise**2 + self.contrast**2 * outside).sqrt()
+        spread = where(self.inside(corner), self.noise, (self.noise**2 + self.contrast**2) ** 0.5)
         return Normal(window(scene, corner, self.view, self.brightness), spread).to_event(2)
+
+    def inside(self, corner: Tensor) -> Tensor:
+        """Tell which pixels of a view at a corner (horizontal, vertical) lie in the scene, (rows, columns)."""
+        left, top = corner.round().unbind(-1)
+        rows, columns = torch.arange(self.view[0]) + top, torch.arange(self.view[1]) + left
+        return ((rows >= 0) & (rows < self.field[0]))[:, None] & (columns >= 0) & (columns < self.field[1])
 
     def middle(self) -> Tensor:
         """Return the (horizontal, vertical) corner of a view at the middle of the scene."""

@@ -21,7 +21,7 @@ from inference.records.swarm import Swarm
 from inference.worlds.bank import Bank
 from inference.worlds.gaussian import Gaussian
 from inference.worlds.gaussian_block import predicted, seen_by
-from inference.worlds.offsets import NoTranslation, Offsets, displacements
+from inference.worlds.offsets import NothingSeen, NoTranslation, Offsets, displacements
 from inference.worlds.plan import Plan, make_plan
 from inference.worlds.rejuvenation import Past, forgotten, rejuvenated
 from inference.worlds.step import BankBelief, Step, even, pick, take_worlds
@@ -202,7 +202,10 @@ class RaoBlackwell(Bank):
         if not self.chooses and not bool((torch.linalg.eigvalsh(prior.covariance) > FINE**2).all()):
             # Where it is known to a fraction of a pixel, a draw of its own does better.
             return super().draw(step, name, given, birth)
-        value, chosen, expected = offsets.choose(step, prior, step.seen, best=self.chooses)
+        try:
+            value, chosen, expected = offsets.choose(step, prior, step.seen, best=self.chooses)
+        except NothingSeen:
+            return super().draw(step, name, given, birth)
         step.gaussian[at], log_p = seen_by(belief, view, value)
         step.score = step.score + (expected if self.chooses else log_p.to(self.dtype)) - chosen
         step.frame.values[name, 0] = value

@@ -27,6 +27,10 @@ class NoTranslation(Exception):
     """What a variable does to an image is no whole-pixel translation of all of it."""
 
 
+class NothingSeen(Exception):
+    """The image is out of sight wherever it is expected to have been moved to: there is nothing to score."""
+
+
 @dataclass(frozen=True)
 class Displacement:
     """A sampled variable (horizontal, vertical) that moves what is seen of an image, and by nothing but that."""
@@ -178,7 +182,7 @@ class Offsets:
         centre, spread = self._predicted(step, value)
         inside, number = centre >= FAR - 0.5, (centre - FAR).round().long()
         if not bool(inside.flatten(2).any(-1).all()):
-            raise NoTranslation(f"nothing is seen of the image where {self.name} is {value.flatten(0, 1)[0].tolist()}")
+            raise NothingSeen(f"nothing is seen of the image where {self.name} is {value.flatten(0, 1)[0].tolist()}")
         found = []
         for axis, place in enumerate((number // shape[1], number % shape[1])):
             line = torch.arange(centre.shape[2 + axis])

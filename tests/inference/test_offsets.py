@@ -1,5 +1,8 @@
 """By how much an image has been moved: against sums over pixels, brute force, and other ways to declare the same."""
 
+import warnings
+from dataclasses import replace
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -167,3 +170,15 @@ def test_missing_pixels_and_batches():
         single = engine.update(single, command, image)
         batch = engine.update(batch, command.expand(2, 2), image.expand(2, 6, 8))
     torch.testing.assert_close(batch.marginal("actuation").mean[1], single.marginal("actuation").mean)
+
+
+@pytest.mark.parametrize("particles", [1, 20])
+def test_who_looks_past_all_there_is_goes_on(particles):
+    """With nothing to compare, a motion is what it was expected to be, and the next is looked for again."""
+    engine = RaoBlackwell(SMALL, particles=particles)
+    belief = engine.update(engine.start(), zeros(2), torch.rand(6, 8))
+    belief = replace(belief, values=belief.values | {"gaze": belief.values["gaze"] + 100.0})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        belief = engine.update(belief, zeros(2), torch.rand(6, 8))
+    assert engine.offsets and torch.isfinite(belief.marginal("actuation").mean).all()
