@@ -33,7 +33,9 @@ class FieldBlock:
         self.states = [name for name in names if roles[name] == "state"]
         self.carried = [name for name in self.states if name in remembered]
         self.group = set(names)
+        # What every step adds to the variance of images that always move in the same way; and those that never move.
         self.added: dict[str, Tensor] = {}
+        self.still: set[str] = set()
 
     def start(self, frame: Frame, befores: dict[str, str | Tensor]) -> Images:
         """Return the images before time began."""
@@ -111,6 +113,8 @@ class FieldBlock:
         if source is None:
             return self._law(name, frame, None)
         mean, variance = (past if source.lag else now)[source.name]
+        if name in self.still:
+            return mean, variance + self.added[name]
         centre, noise = self._law(name, frame, mean)
         spread, _ = self._law(name, frame, variance)
         return centre, spread + self._added(name, frame, mean, noise)
@@ -123,6 +127,9 @@ class FieldBlock:
         added = noise - nothing
         if all(p.name in self.group for p in self.laws.variables[name].parents) and not added.requires_grad:
             self.added[name] = added[:1, :1]
+            numbers = torch.arange(mean[0, 0].numel(), dtype=mean.dtype).reshape(1, 1, *mean.shape[2:])
+            if torch.equal(self._law(name, frame, numbers)[0], numbers):
+                self.still.add(name)
         return added
 
     def _seen(

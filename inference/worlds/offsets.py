@@ -21,6 +21,7 @@ from inference.worlds.plan import Plan
 REACH = 2.5
 # Coordinates begin here, so that what comes in from outside is told from what has a place.
 FAR = 10_000.0
+APART = 6
 
 
 class NoTranslation(Exception):
@@ -180,15 +181,18 @@ class Offsets:
 
     def _corner(self, step: Any, value: Tensor, shape: Any) -> tuple[Tensor, float]:
         centre, spread = self._predicted(step, value)
+        # A grid of pixels shows where the image is; all of them are looked at once, when it is new how they move.
+        apart = 1 if self.outside is None else APART
+        centre, spread = centre[..., ::apart, ::apart], spread[..., ::apart, ::apart]
         inside, number = centre >= FAR - 0.5, (centre - FAR).round().long()
         if not bool(inside.flatten(2).any(-1).all()):
             raise NothingSeen(f"nothing is seen of the image where {self.name} is {value.flatten(0, 1)[0].tolist()}")
         found = []
         for axis, place in enumerate((number // shape[1], number % shape[1])):
-            line = torch.arange(centre.shape[2 + axis])
+            line = apart * torch.arange(centre.shape[2 + axis])
             origin = place - (line[:, None] if axis == 0 else line)
             low = torch.where(inside, origin, shape[axis] + 1).amin((-2, -1))
-            high = torch.where(inside, origin, -centre.shape[2 + axis] - 1).amax((-2, -1))
+            high = torch.where(inside, origin, -apart * centre.shape[2 + axis] - 1).amax((-2, -1))
             if not torch.equal(low, high):
                 raise NoTranslation(f"{self.name} does more to {self.seen} than to move it")
             found.append(low)
