@@ -32,8 +32,9 @@ FIXATIONS = 50
 def two_motors(config: Any, folder: Path, console: Console) -> Result:
     """Learn two motors; see ``conf/experiment/learning_to_look/two_motors.yaml``."""
     seeds, movements = QUICK if config.quick else (config.seeds, config.movements)
-    if seeds < 1 or movements < 2 or not 0 < config.reach <= 1 or not config.heads:
-        raise ValueOutOfRange("two_motors needs a head, 1 seed, 2 movements and a reach in (0, 1], or more")
+    if seeds < 1 or movements < 2 or not 0 < config.reach <= 0.5 or not config.heads:
+        # From one end to the other is a command of twice the reach, and none is larger than 1.
+        raise ValueOutOfRange("two_motors needs a head, 1 seed, 2 movements, or more, and a reach in (0, 0.5]")
     panorama = data.files("panorama", "*.jpg")[0]
     summary: dict[str, float] = {}
     found = {}

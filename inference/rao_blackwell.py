@@ -75,7 +75,8 @@ class RaoBlackwell(Bank):
         statics = self.model.declaration.names["static"]
         self.guide: Any = None
         self._swarm: Swarm | None = None
-        self.offsets = {d.name: Offsets(self, d) for d in displacements(self.structure, self.plan, self.images)}
+        moves = displacements(self.structure, self.plan, self.images)
+        self.offsets = {d.name: Offsets(self, d) for d in moves if self.owner.get(d.name, ("", 0))[0] == "gaussian"}
         self.sampled_statics = [name for name in self.plan.worlds if name in statics]
         self.tried = self.candidates
         if self.offsets and self.chooses and not self.sampled_statics:
@@ -192,9 +193,9 @@ class RaoBlackwell(Bank):
     def draw(self, step: Step, name: str, given: Tensor | None = None, birth: bool = False) -> None:
         """Draw one variable of every world; a displacement by what is seen, of which every offset is scored."""
         offsets = self.offsets.get(name)
-        kind, at = self.owner.get(name, ("", 0))
-        if offsets is None or kind != "gaussian" or given is not None or step.seen is None:
+        if offsets is None or given is not None or step.seen is None:
             return super().draw(step, name, given, birth)
+        _, at = self.owner[name]
         block = self.gaussians[at]
         belief = block.advance(step.gaussian[at], step.frame, name, birth)
         view = block.view(step.frame, name, birth)
@@ -205,7 +206,8 @@ class RaoBlackwell(Bank):
         try:
             value, chosen, expected = offsets.choose(step, prior, step.seen, best=self.chooses)
         except NothingSeen:
-            return super().draw(step, name, given, birth)
+            expected = prior.mean.expand(*step.lead, -1)
+            return super().draw(step, name, expected if self.chooses else None, birth)
         step.gaussian[at], log_p = seen_by(belief, view, value)
         step.score = step.score + (expected if self.chooses else log_p.to(self.dtype)) - chosen
         step.frame.values[name, 0] = value

@@ -58,7 +58,7 @@ def test_when_an_error_is_small_for_the_first_time():
     assert np.isnan(first_within(np.array([1.0, 0.03]), 0.02))
 
 
-@pytest.mark.parametrize("words", [["seeds=0"], ["reach=2"], ["movements=1"]])
+@pytest.mark.parametrize("words", [["seeds=0"], ["reach=0.6"], ["movements=1"]])
 def test_bad_two_motors(tmp_path, words):
     code, _, complaint = apmodels(tmp_path, "experiment=learning_to_look/two_motors", *words)
     assert code == 2 and one_sentence(complaint)

@@ -182,3 +182,31 @@ def test_who_looks_past_all_there_is_goes_on(particles):
         warnings.simplefilter("ignore")
         belief = engine.update(belief, zeros(2), torch.rand(6, 8))
     assert engine.offsets and torch.isfinite(belief.marginal("actuation").mean).all()
+    assert particles > 1 or belief.values["motion"].flatten().tolist() == [0, 0]
+
+
+def test_a_motion_of_which_nothing_is_integrated_is_tried_as_before():
+    class Pushed(Model):
+        """The motors are known, and slip."""
+
+        push = action(Box(-3.0, 3.0, (2,)))
+        scene = static(lambda self: Normal(0.5 * ones(12, 12), 0.5).to_event(2))
+
+        @state
+        def motion(self, push):
+            return Normal(push, 1.0).to_event(1)
+
+        @observation
+        def image(self, scene, motion):
+            return Normal(window(scene, 4 + motion, (4, 4)), 0.1).to_event(2)
+
+    engine = RaoBlackwell(Pushed(), particles=1)
+    assert not engine.offsets and engine.candidates > 100
+    with seeded(0):
+        scene = torch.rand(12, 12)
+    belief, moved = engine.start(), []
+    for column, row in ((4, 4), (5, 3), (4, 5)):
+        belief = engine.update(belief, zeros(2), scene[row : row + 4, column : column + 4])
+        moved.append(belief.values["motion"].round().flatten())
+    # The first look may be anywhere: nothing has been seen before.
+    assert [(m - moved[0]).tolist() for m in moved] == [[0, 0], [1, -1], [0, 1]]
