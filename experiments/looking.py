@@ -111,16 +111,16 @@ def learn(head: Any, engine: Any, movements: int, reach: float, seed: int) -> xr
 
 def _fixations(head: Any, actuation: np.ndarray, random: np.random.Generator) -> list[float]:
     """Look at things that are seen anywhere in the image, from the middle of all that can be seen."""
-    slip, head.slip, missed = head.slip, 0.0, []
-    half = (np.array(head.size[::-1]) - 1) / 2
-    for _ in range(FIXATIONS):
-        head.angles = np.zeros(2)
-        target = random.uniform(-0.9, 0.9, 2) * half
-        # What is to be seen in the middle must move there.
-        command = gaze_shift(torch.as_tensor(actuation), torch.zeros(actuation.shape), torch.as_tensor(-target))
-        head.turn(command.numpy())
-        missed.append(float(np.hypot(*head.follow(target, np.zeros(2), head.angles))) / head.size[1])
-    head.slip = slip
+    half, missed = (np.array(head.size[::-1]) - 1) / 2, []
+    middle = np.zeros_like(head.angles)
+    with head.noiseless():
+        for _ in range(FIXATIONS):
+            head.angles = middle
+            target = random.uniform(-0.9, 0.9, 2) * half
+            # What is to be seen in the middle must move there.
+            command = gaze_shift(torch.as_tensor(actuation), torch.zeros(actuation.shape), torch.as_tensor(-target))
+            head.turn(command.numpy())
+            missed.append(float(np.hypot(*head.follow(target, middle, head.angles))) / head.size[1])
     return missed
 
 

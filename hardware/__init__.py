@@ -13,11 +13,18 @@ if TYPE_CHECKING:
     from hardware.fovea import Fovea as Fovea
 
     # Heads.
+    from hardware.heads import DiegoSan as DiegoSan
+    from hardware.heads import Einstein as Einstein
+    from hardware.heads import Nobody as Nobody
     from hardware.panorama_head import PanoramaHead as PanoramaHead
+    from hardware.people import Person as Person
     from hardware.photo import PhotoError as PhotoError
     from hardware.photo import read_photo as read_photo
     from hardware.photo_eye import PhotoEye as PhotoEye
     from hardware.photo_eye import whole_image as whole_image
+    from hardware.physics_head import Joint as Joint
+    from hardware.physics_head import PhysicsHead as PhysicsHead
+    from hardware.room import Room as Room
     from hardware.simulated import Simulated as Simulated
 
     # Sound.
@@ -37,7 +44,14 @@ _FILES = {
     "Body": "body",
     "Simulated": "simulated",
     # Heads.
+    "DiegoSan": "heads",
+    "Einstein": "heads",
+    "Joint": "physics_head",
+    "Nobody": "heads",
     "PanoramaHead": "panorama_head",
+    "Person": "people",
+    "PhysicsHead": "physics_head",
+    "Room": "room",
     # The digital eye.
     "CascadeDetector": "detectors",
     "Detector": "detectors",

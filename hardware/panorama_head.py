@@ -7,7 +7,8 @@ that is mounted askew, and noise of sensor and motors (thesis ch. 6: what learni
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import cv2
@@ -15,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hardware.lens import Lens, mean_flow
 from hardware.photo import as_photo
 
 __all__ = ["PanoramaHead"]
@@ -52,19 +54,15 @@ class PanoramaHead:
         self.gains = np.asarray(gains, dtype=float)
         if self.gains.ndim != 2 or len(self.gains) != 2 or not np.isfinite(self.gains).all():
             raise ValueError(f"gains are (2, motors), to the right and up, not of shape {self.gains.shape}.")
-        if not 0 < view < 150 or min(slip, sensor) < 0 or min(limits) <= 0 or not -0.5 < distortion < 0.5:
-            raise ValueError(
-                "a view is less than 150 degrees, noise is 0 or more, limits are above 0 and distortion is within 0.5, "
-                f"not {view}, {slip}, {sensor}, {limits} and {distortion}."
-            )
-        self.size, self.focal = tuple(size), size[1] / 2 / math.tan(math.radians(view) / 2)
+        if min(slip, sensor) < 0 or min(limits) <= 0:
+            raise ValueError(f"noise is 0 or more and limits are above 0, not {slip}, {sensor} and {limits}.")
+        self.lens = Lens(size, view, roll, distortion)
+        self.size, self.focal = self.lens.size, self.lens.focal
         self.slip, self.sensor, self.limits = slip, sensor, np.asarray(limits, dtype=float)
         # As fine as the image and no finer, or what is seen would flicker as it moves.
         wanted = 360 / math.degrees(1 / self.focal)
         share = min(1.0, 1.2 * wanted / grey.shape[1])
         self.panorama = cv2.resize(grey, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
-        self.roll, self.distortion = math.radians(roll), distortion
-        self.rays = self._rays()
         self.reset(0)
 
     @property
@@ -98,7 +96,7 @@ class PanoramaHead:
 
     def render(self, angles: np.ndarray) -> np.ndarray:
         """Return the image without noise at angles to the right and up, degrees."""
-        world = self.rays @ _turned(*np.radians(angles)).T.astype(np.float32)
+        world = self.lens.rays @ _turned(*np.radians(angles)).T.astype(np.float32)
         height, width = self.panorama.shape
         longitude, latitude = np.arctan2(world[..., 0], world[..., 2]), np.arcsin(np.clip(world[..., 1], -1, 1))
         across = (longitude / (2 * math.pi) + 0.5) * width - 0.5
@@ -112,43 +110,25 @@ class PanoramaHead:
         )
         return seen.astype(np.float32) / 255
 
+    @contextmanager
+    def noiseless(self) -> Iterator[None]:
+        """Let motors do exactly as they are told, for a while."""
+        slip, self.slip = self.slip, 0.0
+        try:
+            yield
+        finally:
+            self.slip = slip
+
     def flow(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """Return how far what is seen moves between angles, (horizontal, vertical) pixels: the mean where both see."""
         # Where the rays of the image before are in the image after.
-        camera = self.rays @ (_turned(*np.radians(before)).T @ _turned(*np.radians(after))).astype(np.float32)
-        moved = self._pixels(camera) - self._pixels(self.rays)
-        there = self._pixels(camera) + (np.array(self.size[::-1]) - 1) / 2
-        inside = ((there >= 0) & (there <= np.array(self.size[::-1]) - 1)).all(-1) & (camera[..., 2] > 0)
-        return moved[inside].mean(0) if inside.any() else np.full(2, np.nan)
+        turn = _turned(*np.radians(before)).T @ _turned(*np.radians(after))
+        return mean_flow(self.lens, self.lens.rays @ turn.astype(np.float32))
 
     def follow(self, pixel: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """Return where what was seen at a pixel, (right, down) of the middle, is seen after a turn between angles."""
-        row, column = (np.asarray(pixel)[::-1] + (np.array(self.size) - 1) / 2).round().astype(int)
         turn = _turned(*np.radians(before)).T @ _turned(*np.radians(after))
-        return self._pixels(self.rays[row, column] @ turn)
-
-    def _pixels(self, directions: np.ndarray) -> np.ndarray:
-        """Where directions (right, up, ahead) are seen, (right, down) of the image's middle, pixels."""
-        flat = directions[..., :2].astype(float) / directions[..., 2:] * self.focal
-        c, s = math.cos(self.roll), math.sin(self.roll)
-        x, y = flat[..., 0] * c + flat[..., 1] * s, flat[..., 1] * c - flat[..., 0] * s
-        corner, shrunk = (self.size[0] ** 2 + self.size[1] ** 2) / 4, np.ones_like(x)
-        for _ in range(20):
-            shrunk = 1 - self.distortion * np.minimum((x**2 + y**2) * shrunk**2 / corner, 1.5)
-        return np.stack([x * shrunk, -y * shrunk], -1)
-
-    def _rays(self) -> np.ndarray:
-        """Directions (right, up, ahead) of all pixels, (rows, columns, 3)."""
-        rows, columns = self.size
-        y, x = np.mgrid[:rows, :columns].astype(float)
-        x, y = x - (columns - 1) / 2, (rows - 1) / 2 - y
-        corner = (columns**2 + rows**2) / 4
-        stretch = 1 / (1 - self.distortion * (x**2 + y**2) / corner)
-        x, y = x * stretch, y * stretch
-        c, s = math.cos(self.roll), math.sin(self.roll)
-        x, y = x * c - y * s, x * s + y * c
-        rays = np.stack([x, y, np.full_like(x, self.focal)], -1)
-        return (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
+        return self.lens.pixels(self.lens.ray(pixel) @ turn)
 
 
 def _turned(right: float, up: float) -> np.ndarray:
