@@ -17,8 +17,13 @@ from apmodels.detector_search import DetectorSearch as DetectorSearch
 from apmodels.errors import DeclarationError as DeclarationError
 from apmodels.errors import ValueOutOfRange as ValueOutOfRange
 from apmodels.evidence import Evidence as Evidence
+from apmodels.kidnapped import Kidnapped as Kidnapped
 from apmodels.learning_to_look import LearningToLook as LearningToLook
 from apmodels.model import Model as Model
+from apmodels.motor_dynamics import MotorDynamics as MotorDynamics
+from apmodels.motor_noise import MotorErrors as MotorErrors
+from apmodels.motor_noise import MotorNoise as MotorNoise
+from apmodels.motor_noise import NoisyMotors as NoisyMotors
 from apmodels.planted import Planted as Planted
 from apmodels.spaces import Binary as Binary
 from apmodels.spaces import Box as Box

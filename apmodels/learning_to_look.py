@@ -30,6 +30,7 @@ class LearningToLook(Model):
         contrast: its standard deviation (σ_0,L).
         change: of how the scene changes from command to command (σ_L).
         noise: of the camera's pixels (σ_Y).
+        bias: whether there may also be a movement that is the same whatever the command (eq. 6.7).
     """
 
     motors: int = 2
@@ -42,6 +43,7 @@ class LearningToLook(Model):
     contrast: float = 0.5
     change: float = 0.01
     noise: float = 0.1
+    bias: bool = False
 
     def __post_init__(self) -> None:
         if self.motors < 1 or not all(0 < small <= large for small, large in zip(self.view, self.field, strict=True)):
@@ -52,10 +54,19 @@ class LearningToLook(Model):
 
     command = action(lambda self: Box(-1.0, 1.0, (self.motors,)))
 
+    @property
+    def causes(self) -> int:
+        """How many features of a command move what is seen."""
+        return self.motors + self.bias
+
+    def features(self, command: Tensor) -> Tensor:
+        """Return what of a command moves what is seen, (causes,): the thesis's φ. Override it for another."""
+        return torch.cat([command, ones(1)]) if self.bias else command
+
     @static
     def first_actuation(self):
-        """How far a unit of each motor's command moves what is seen, when born, (2, motors), pixels."""
-        return Normal(zeros(2, self.motors), self.gain).to_event(2)
+        """How far a unit of each feature of a command moves what is seen, when born, (2, causes), pixels."""
+        return Normal(zeros(2, self.causes), self.gain).to_event(2)
 
     @static
     def first_scene(self):
@@ -64,13 +75,13 @@ class LearningToLook(Model):
 
     @state
     def actuation(self, prev_actuation=first_actuation):
-        """How far a unit of each motor's command moves what is seen, (2, motors), pixels (eq. 6.25)."""
+        """How far a unit of each feature of a command moves what is seen, (2, causes), pixels (eq. 6.25)."""
         return Normal(prev_actuation, self.wear).to_event(2)
 
     @state
     def motion(self, actuation, command):
         """By how much what is seen moves, (horizontal, vertical), pixels (eq. 6.24)."""
-        return Normal(actuation @ command, self.slip).to_event(1)
+        return Normal(actuation @ self.features(command), self.slip).to_event(1)
 
     @state
     def gaze(self, motion, prev_gaze=lambda self: zeros(2)):

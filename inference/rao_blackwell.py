@@ -21,10 +21,11 @@ from inference.records.swarm import Swarm
 from inference.worlds.bank import Bank
 from inference.worlds.gaussian import Gaussian
 from inference.worlds.gaussian_block import predicted, seen_by
-from inference.worlds.offsets import NothingSeen, NoTranslation, Offsets, displacements
+from inference.worlds.offsets import NothingSeen, NoTranslation, Offsets, displacements, follow
 from inference.worlds.plan import Plan, make_plan
 from inference.worlds.rejuvenation import Past, forgotten, rejuvenated
 from inference.worlds.step import BankBelief, Step, even, pick, take_worlds
+from inference.worlds.trying import combinations, give
 
 # How many values are tried where one particle is kept.
 CANDIDATES = 256
@@ -78,9 +79,14 @@ class RaoBlackwell(Bank):
         moves = displacements(self.structure, self.plan, self.images)
         self.offsets = {d.name: Offsets(self, d) for d in moves if self.owner.get(d.name, ("", 0))[0] == "gaussian"}
         self.sampled_statics = [name for name in self.plan.worlds if name in statics]
-        self.tried = self.candidates
+        self.tried, self.every = self.candidates, {}
         if self.offsets and self.chooses and not self.sampled_statics:
-            self.candidates = 1
+            self.every = combinations(self.structure, self.plan.worlds, self.candidates)
+            self.candidates = len(next(iter(self.every.values()), (0,)))
+        for name in self.offsets:
+            # As late as can be: what is seen after a displacement may depend on what else has happened.
+            after = follow(self.structure, name)
+            self.order = [n for n in self.order if n not in after] + [n for n in self.order if n in after]
 
     def divide(self, structure: Structure, given: str | Iterable[str]) -> Plan:
         """Return the plan: what is sampled by rule, and what is sampled by wish."""
@@ -159,7 +165,7 @@ class RaoBlackwell(Bank):
         with seeded(self.seed * 1_000_003 + belief.time + 1):
             if self.particles > 1:
                 belief = self.refreshed(belief)
-            elif belief.log_weights.shape[1] == 1 and not self.offsets:
+            elif belief.log_weights.shape[1] == 1 < self.candidates:
                 belief = spread(belief, self.candidates)
             step, known = self.step_of(belief, actions)
             step.seen = seen
@@ -167,7 +173,7 @@ class RaoBlackwell(Bank):
                 step = self.propagate(step, seen)
             except NoTranslation:
                 # The graph would have allowed it, the laws do not: values are tried, as for any other variable.
-                self.offsets, self.candidates = {}, self.tried
+                self.offsets, self.every, self.candidates = {}, {}, self.tried
                 return self.update(before, action, observation)
             weights = belief.log_weights + step.score
             if self.particles == 1:
@@ -193,6 +199,8 @@ class RaoBlackwell(Bank):
     def draw(self, step: Step, name: str, given: Tensor | None = None, birth: bool = False) -> None:
         """Draw one variable of every world; a displacement by what is seen, of which every offset is scored."""
         offsets = self.offsets.get(name)
+        if given is None and step.seen is not None and name in self.every:
+            return give(self, step, name, self.every[name])
         if offsets is None or given is not None or step.seen is None:
             return super().draw(step, name, given, birth)
         _, at = self.owner[name]

@@ -46,6 +46,8 @@ class Bank(Asking):
         self.roles = {name: variable.role for name, variable in model.declaration.variables.items()}
         shapes = {node.name: tuple(node.shape) for node in nodes.values()}
         self.linear = Linear(model, shapes)
+        # In which order a step's states happen.
+        self.order = list(model.declaration.names["state"])
         self.functions: dict[str, Tensor] = {}
         self.owner: dict[str, tuple[str, int]] = {}
         remembered = model.declaration.remembered
@@ -159,7 +161,7 @@ class Bank(Asking):
 
     def move(self, step: Step, given: Values | None = None) -> None:
         """Move the worlds on: draw their states, or score the ones ``given`` (rows, worlds, *shape)."""
-        for name in self.model.declaration.names["state"]:
+        for name in self.order:
             if name in self.plan.computed:
                 value = step.frame.in_all(self.laws, name, step.frame.lead(self._parents(name)))
                 step.frame.values[name, 0] = value  # type: ignore[assignment]

@@ -46,14 +46,22 @@ def displacements(structure: Structure, plan: Plan, images: list[FieldBlock]) ->
     drawn = [name for name in plan.worlds if structure.nodes[name].role == "state"]
     found = []
     for i, block in enumerate(images):
-        if len(drawn) == 1 and len(block.seen) == 1 and structure.nodes[drawn[0]].shape == (2,):
-            reached, names = {drawn[0]}, [*plan.computed, *block.states, *block.seen]
-            for name in [n for n in structure.nodes if n in names]:
-                if any(arrow.parent in reached and not arrow.lag for arrow in structure.into(name)):
-                    reached.add(name)
-            if block.seen[0] in reached:
-                found.append(Displacement(drawn[0], i, block.seen[0]))
+        last = [name for name in drawn if structure.nodes[name].values is None][-1:]
+        if last and len(block.seen) == 1 and structure.nodes[last[0]].shape == (2,):
+            reached = follow(structure, last[0])
+            # What else is drawn must be there before the offsets are scored.
+            if block.seen[0] in reached and not (reached & set(drawn)) - {last[0]}:
+                found.append(Displacement(last[0], i, block.seen[0]))
     return found
+
+
+def follow(structure: Structure, name: str) -> set[str]:
+    """Return a variable and all that follows from it within a step."""
+    reached = {name}
+    for other in structure.nodes:
+        if any(arrow.parent in reached and not arrow.lag for arrow in structure.into(other)):
+            reached.add(other)
+    return reached
 
 
 def offset_scores(seen: Tensor, mean: Tensor, variance: Tensor) -> Tensor:
@@ -96,7 +104,8 @@ class Offsets:
     def __init__(self, bank: Any, displacement: Displacement):
         self.bank, self.block = bank, bank.images[displacement.field]
         self.name, self.seen, self.field = displacement.name, displacement.seen, displacement.field
-        self.outside: tuple[float, float] | None = None
+        # Mean and variance of what comes in from outside, (rows or 1, worlds or 1), once it is known.
+        self.outside: tuple[Tensor, Tensor] | None = None
         # Whether the image moves, if at all, in the same way at every step; then coordinates are moved once.
         parents = [p for state in self.block.states for p in bank.laws.variables[state].parents]
         self.still = all(p.name in self.block.group for p in parents)
@@ -131,7 +140,8 @@ class Offsets:
         field_mean, field_variance = images[next(iter(images)) if len(images) == 1 else self.block.carried[0]]
         near, reach = mean.round(), self._reach(covariance, field_mean.shape[-2:])
         base, noise = self._base(step, near.to(self.bank.dtype), field_mean.shape[-2:])
-        scores = offset_scores(seen, *self._region(field_mean, field_variance + noise, base, reach, step.lead))
+        variance = field_variance + noise[..., None, None]
+        scores = offset_scores(seen, *self._region(field_mean, variance, base, reach, step.lead))
         if self.sign > 0:
             # What moves to the right was further left before.
             scores = scores.flip(-2, -1)
@@ -172,48 +182,59 @@ class Offsets:
             images[name] = numbers, torch.zeros_like(numbers)
         return images
 
-    def _base(self, step: Any, value: Tensor, shape: Any) -> tuple[Tensor, float]:
+    def _base(self, step: Any, value: Tensor, shape: Any) -> tuple[Tensor, Tensor]:
         """Where what is seen begins in the image, (rows, worlds, 2) as (row, column), and the noise on the way."""
-        corner, noise = self._corner(step, value, shape)
-        if self.outside is None:
-            self._learn(step, value, corner, shape)
+        corner, noise, seen = self._corner(step, value, shape)
+        if not bool(seen.any()):
+            raise NothingSeen(f"nothing is seen of the image where {self.name} is {value.flatten(0, 1)[0].tolist()}")
+        if self.outside is None or not self.still:
+            self._learn(step, value, corner, shape, seen)
         return corner, noise
 
-    def _corner(self, step: Any, value: Tensor, shape: Any) -> tuple[Tensor, float]:
+    def _corner(self, step: Any, value: Tensor, shape: Any) -> tuple[Tensor, Tensor, Tensor]:
+        """The corner (rows, worlds, 2), the noise and whether anything is seen at all (rows or 1, worlds or 1)."""
         centre, spread = self._predicted(step, value)
         # A grid of pixels shows where the image is; all of them are looked at once, when it is new how they move.
         apart = 1 if self.outside is None else APART
         centre, spread = centre[..., ::apart, ::apart], spread[..., ::apart, ::apart]
         inside, number = centre >= FAR - 0.5, (centre - FAR).round().long()
-        if not bool(inside.flatten(2).any(-1).all()):
-            raise NothingSeen(f"nothing is seen of the image where {self.name} is {value.flatten(0, 1)[0].tolist()}")
+        some = inside.flatten(2).any(-1)
         found = []
         for axis, place in enumerate((number // shape[1], number % shape[1])):
             line = apart * torch.arange(centre.shape[2 + axis])
             origin = place - (line[:, None] if axis == 0 else line)
             low = torch.where(inside, origin, shape[axis] + 1).amin((-2, -1))
             high = torch.where(inside, origin, -apart * centre.shape[2 + axis] - 1).amax((-2, -1))
-            if not torch.equal(low, high):
+            if not torch.equal(low[some], high[some]):
                 raise NoTranslation(f"{self.name} does more to {self.seen} than to move it")
-            found.append(low)
-        least, most = torch.aminmax(spread[inside.expand_as(spread)])
-        if least != most:
+            # Where nothing is seen, it is all far away.
+            found.append(torch.where(some, low, int(10 * FAR)))
+        spread = spread.expand_as(centre)
+        least = torch.where(inside, spread, torch.inf).amin((-2, -1))
+        if not torch.equal(least[some], torch.where(inside, spread, -torch.inf).amax((-2, -1))[some]):
             raise NoTranslation(f"the noise of {self.seen} is not the same in all of it")
-        return torch.stack(found, -1).expand(*step.lead, 2), float(least)
+        return torch.stack(found, -1).expand(*step.lead, 2), torch.where(some, least, 0.0), some
 
-    def _learn(self, step: Any, near: Tensor, base: Tensor, shape: Any) -> None:
+    def _learn(self, step: Any, near: Tensor, base: Tensor, shape: Any, seen: Tensor) -> None:
         """Find out which way the displacement moves the image, and what comes in from outside."""
         moved = torch.tensor([3.0, -2.0], dtype=near.dtype)
-        change = self._corner(step, near + moved, shape)[0] - base
-        for sign in (1, -1):
-            if bool((change == -sign * moved.flip(0)).all()):
-                self.sign = sign
         if not self.sign:
-            raise NoTranslation(f"{self.name} does not move {self.seen} by whole pixels")
-        centre, spread = self._predicted(step, near + 10 * FAR)
-        if bool((centre >= FAR - 0.5).any()) or bool((centre != centre.flatten()[0]).any()):
-            raise NoTranslation(f"what comes into {self.seen} from outside is not all alike")
-        self.outside = float(centre.flatten()[0]), float(spread.flatten()[0])
+            corner, _, still = self._corner(step, near + moved, shape)
+            change = (corner - base)[(seen & still).expand(step.lead)]
+            for sign in (1, -1):
+                if len(change) and bool((change == -sign * moved.flip(0)).all()):
+                    self.sign = sign
+            if not self.sign:
+                raise NoTranslation(f"{self.name} does not move {self.seen} by whole pixels")
+        parts = []
+        for part in self._predicted(step, near + 10 * FAR):
+            first = part.flatten(2)[..., 0]
+            if bool((part != first[..., None, None]).any()):
+                raise NoTranslation(f"what comes into {self.seen} from outside is not all alike")
+            parts.append(first)
+        if bool((parts[0] >= FAR - 0.5).any()):
+            raise NoTranslation(f"{self.seen} is of the image however far {self.name} moves it")
+        self.outside = parts[0], parts[1]
 
     def _region(
         self, mean: Tensor, variance: Tensor, base: Tensor, reach: tuple[int, int], lead: tuple[int, int]
@@ -231,5 +252,5 @@ class Offsets:
         for image, fill in zip((mean, variance), self.outside, strict=True):
             flat = image.expand(*lead, height, width).flatten(2)
             picked = flat.gather(2, at.flatten(2)).reshape(inside.shape)
-            parts.append(torch.where(inside, picked, fill))
+            parts.append(torch.where(inside, picked, fill[..., None, None]))
         return parts[0], parts[1]
