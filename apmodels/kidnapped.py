@@ -34,6 +34,6 @@ class Kidnapped(LearningToLook):
     def scene(self, lost, prev_scene=LearningToLook.first_scene):
         """What is out there; the scene that was is farther away than the image is large."""
         away = lost * 2.0 * max(self.field) * torch.ones(2)
-        return Normal(
-            shift(prev_scene, away, self.brightness), where(lost == 1, self.contrast, self.change)
-        ).to_event(2)
+        return Normal(shift(prev_scene, away, self.brightness), where(lost == 1, self.contrast, self.change)).to_event(
+            2
+        )

@@ -86,8 +86,8 @@ class NoisyMotors(Model):
 class MotorErrors(Model):
     """How far movements end from where they should have, told as the thesis tells it: a Kalman filter (section 6.6.5).
 
-    |m - Au| is seen as if it were Normal about the sum of what every motor adds, which it is not: errors add in squares.
-    Its mean is sqrt(2/π) of a standard deviation, and that the thesis leaves out.
+    |m - Au| is seen as if it were Normal about the sum of what every motor adds, which it is not: errors add in
+    squares. Its mean is sqrt(2/π) of a standard deviation, and that the thesis leaves out.
 
     Args:
         motors: how many.

@@ -5,6 +5,7 @@ from controllers.constant import Constant as Constant
 from controllers.controller import Controller as Controller
 from controllers.dynamic_programming import DynamicProgramming as DynamicProgramming
 from controllers.entropy_limit import EntropyLimit as EntropyLimit
+from controllers.gaze_shift import GazeShift as GazeShift
 from controllers.greedy_infomax import GreedyInfomax as GreedyInfomax
 from controllers.handover import Handover as Handover
 from controllers.most_probable import MostProbable as MostProbable

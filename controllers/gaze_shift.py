@@ -6,7 +6,55 @@ import torch
 from scipy.optimize import lsq_linear
 from torch import Tensor
 
-from apmodels import ValueOutOfRange
+from apmodels import Box, ValueOutOfRange
+from controllers.controller import Controller
+from inference import Belief, Engine, Refusal
+
+
+class GazeShift(Controller):
+    """Moves what is seen to where it is wanted, by motors that are learned.
+
+    Each motor's part is the less, the noisier it is and the less is known of it: E|m - (a + ã)u|² also has what is
+    not known of a, whose entries are taken to be independent. No motor is told more than its space allows.
+
+    Args:
+        engine: of a model with a hidden variable (D, K) by which an action (K,) moves something in D directions.
+        by: its name.
+        noise: the standard deviation that a unit of each motor adds, (D, K), or the name of a hidden variable that is.
+        goal: where to, (D,), until ``aim`` says otherwise; not at all by default.
+        seed: not used; a gaze shift is not drawn.
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        by: str = "actuation",
+        noise: Tensor | str | None = None,
+        goal: Tensor | None = None,
+        seed: int = 0,
+    ):
+        super().__init__(engine, seed)
+        name, space = self.only_action()
+        hidden = {node.name: node.shape for node in self.model.structure.hidden}
+        for part in (by, noise):
+            if isinstance(part, str) and len(hidden.get(part, ())) != 2:
+                raise Refusal(f"GazeShift needs a hidden matrix by which {name} moves the gaze; {part} is none")
+        if not isinstance(space, Box) or space.shape != (hidden[by][1],):
+            raise Refusal(f"GazeShift needs an action of {hidden[by][1]} numbers, a motor each; {name} is {space}")
+        self.space, self.by, self.noise = space, by, noise
+        self.aim(torch.zeros(hidden[by][0]) if goal is None else goal)
+
+    def aim(self, goal: Tensor) -> None:
+        """Say by how much what is seen shall move, (*batch, D), in the units of the variable."""
+        self.goal = torch.as_tensor(goal, dtype=torch.float64)
+
+    def act(self, belief: Belief) -> Tensor:
+        """Return commands, (*batch, K)."""
+        law = belief.marginal(self.by)
+        noise = 0.0 if self.noise is None else self.noise
+        noise = belief.marginal(noise).mean if isinstance(noise, str) else torch.as_tensor(noise)
+        spread = (noise.double() ** 2 + law.variance.double()).sqrt()
+        return gaze_shift(law.mean, spread, self.goal, self.space.low, self.space.high).to(law.mean.dtype)
 
 
 def gaze_shift(

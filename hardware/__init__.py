@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from hardware.heads import Nobody as Nobody
     from hardware.panorama_head import PanoramaHead as PanoramaHead
     from hardware.people import Person as Person
+    from hardware.phantom_limbs import PhantomLimbs as PhantomLimbs
     from hardware.photo import PhotoError as PhotoError
     from hardware.photo import read_photo as read_photo
     from hardware.photo_eye import PhotoEye as PhotoEye
@@ -50,6 +51,7 @@ _FILES = {
     "Nobody": "heads",
     "PanoramaHead": "panorama_head",
     "Person": "people",
+    "PhantomLimbs": "phantom_limbs",
     "PhysicsHead": "physics_head",
     "Room": "room",
     # The digital eye.

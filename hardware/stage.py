@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import tempfile
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -18,9 +21,24 @@ TICK = 1 / 240
 def pybullet() -> Any:
     """Return the physics engine."""
     try:
-        return import_module("pybullet")
+        with _quiet():
+            return import_module("pybullet")
     except ImportError:
         raise ImportError("Heads in physics need the extra 'physics': pip install 'apmodels[physics]'.") from None
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Let nothing be written to standard output, by C code either: the engine tells when it was built."""
+    sys.stdout.flush()
+    kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 1)
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+        os.close(nowhere)
 
 
 class Stage:
