@@ -22,9 +22,9 @@ def draw_motors(found: dict[str, xr.Dataset], off: Callable[[xr.Dataset], xr.Dat
         column[1].legend(fontsize=8)
         apart = np.hypot(*(learned.moved - learned.expected).transpose("direction", ...).values)
         _spread(column[2], learned.movement[1:], apart[:, 1:])
-        column[2].set(ylabel="found from expected movement (pixels)", yscale="log")
+        column[2].set(ylabel="found from expected (pixels)", yscale="log")
         _spread(column[3], learned.movement[1:], learned.evidence.transpose("seed", "movement").values[:, 1:])
-        column[3].set(xlabel="movements", ylabel="log evidence of the image (nats a pixel)")
+        column[3].set(xlabel="movements", ylabel="log evidence (nats a pixel)")
     return figure
 
 
@@ -37,7 +37,7 @@ def _gains(axis: Any, name: str, learned: xr.Dataset) -> None:
             axis.plot(one.movement, mean, color=colours(k), ls=("-", "--")[d], label=f"motor {k + 1}, {direction}")
             axis.fill_between(one.movement, mean - 2 * spread, mean + 2 * spread, color=colours(k), alpha=0.15, lw=0)
             axis.axhline(float(one.best.isel(direction=d, motor=k)), color=colours(k), ls=":", lw=0.8)
-    axis.set(title=name, ylabel="pixels a unit of command (seed 0; dotted: true)")
+    axis.set(title=f"{name} (gains: seed 0)", ylabel="pixels a unit (dotted: true)")
     axis.set_ylim(1.6 * float(one.best.min()) - 50, 1.6 * float(max(one.best.max(), 0)) + 50)
     axis.legend(fontsize=7, ncols=2)
 

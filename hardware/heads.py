@@ -34,18 +34,22 @@ class Nobody(PhysicsHead):
     """A webcam on two servos."""
 
     def __init__(self, scene: Any, **settings: Any):
-        super().__init__(NOBODY, scene, **{"camera": (0.0, 0.03, 0.02)} | settings)
+        super().__init__(NOBODY, scene, **_with(settings, camera=(0.0, 0.03, 0.02)))
 
 
 class DiegoSan(PhysicsHead):
     """An eye that two motors turn, mounted a little askew, with a lens that distorts."""
 
     def __init__(self, scene: Any, **settings: Any):
-        super().__init__(DIEGO_SAN, scene, **{"roll": 3.0, "distortion": 0.05} | settings)
+        super().__init__(DIEGO_SAN, scene, **_with(settings, roll=3.0, distortion=0.05))
 
 
 class Einstein(PhysicsHead):
     """Five motors: eyes left/right, head left/right, eyes up/down, upper nod, lower nod, in this order (eq. 6.8)."""
 
     def __init__(self, scene: Any, **settings: Any):
-        super().__init__(EINSTEIN, scene, **{"chain": EINSTEIN_CHAIN} | settings)
+        super().__init__(EINSTEIN, scene, **_with(settings, chain=EINSTEIN_CHAIN))
+
+
+def _with(settings: dict[str, Any], **defaults: Any) -> dict[str, Any]:
+    return defaults | settings
