@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import torch
-from pyro.distributions import Bernoulli, Normal
+from pyro.distributions import Normal
+from pyro.distributions.torch import Bernoulli  # type: ignore[attr-defined]
 
 from apmodels.errors import ValueOutOfRange
 from apmodels.learning_to_look import LearningToLook

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 import torch
-from pyro.distributions import HalfNormal, Normal
+from pyro.distributions import Normal
+from pyro.distributions.torch import HalfNormal  # type: ignore[attr-defined]
 from torch import Tensor
 
 from apmodels.errors import ValueOutOfRange

@@ -70,7 +70,7 @@ def phantom_limbs(config: Any, folder: Path, console: Console) -> Result:
     }
     console.print(
         f"what does nothing is found to do {summary['phantom_gain_median']:.2%} of what a motor does (median; worst "
-        f"{summary['phantom_gain']:.2%}), never more than {KNOWN:.0%} after {summary['phantom_movements']:.0f} movements"
+        f"{summary['phantom_gain']:.2%}), then below {KNOWN:.0%} after {summary['phantom_movements']:.0f} movements"
     )
     figures = {"phantom_limbs": draw_gains(found), "learning": draw_motors(found, off, KNOWN)}
     return Result(summary, dict(found), figures)

@@ -20,11 +20,11 @@ DIEGO_SAN = (
 )
 # In the order of the thesis's commands (eq. 6.8).
 EINSTEIN = (
-    Joint("eye left/right", "right", 40, 30, (0, 0.08, 0.05), latency=0.15, quickness=25, noise=0.2, mass=0.05),
-    Joint("head left/right", "right", 60, 55, (0, 0, 0.08), latency=0.2, quickness=14, noise=0.03, mass=1.2),
-    Joint("eye up/down", "up", 30, 25, (0, 0, 0), latency=0.15, quickness=25, noise=0.2, mass=0.05),
-    Joint("upper nod", "up", 25, 25, (0, 0.02, 0.06), latency=0.2, quickness=18, damping=0.35, noise=0.12, mass=1.0),
-    Joint("lower nod", "up", 25, 25, (0, 0, 0), latency=0.2, quickness=18, damping=0.55, noise=0.03, mass=1.5),
+    Joint("eye left/right", "right", 40, 30, (0, 0.08, 0.05), latency=0.13, quickness=15, noise=0.2, mass=0.05),
+    Joint("head left/right", "right", 60, 55, (0, 0, 0.08), latency=0.12, quickness=10, noise=0.03, mass=1.2),
+    Joint("eye up/down", "up", 30, 25, (0, 0, 0), latency=0.13, quickness=15, noise=0.2, mass=0.05),
+    Joint("upper nod", "up", 25, 25, (0, 0.02, 0.06), latency=0.14, quickness=14, damping=0.55, noise=0.12, mass=1.0),
+    Joint("lower nod", "up", 25, 25, (0, 0, 0), latency=0.1, quickness=12, damping=0.9, noise=0.03, mass=1.5),
 )
 # From the foot to the camera: the lower nod carries the head's turn, that the upper nod, that the eyes.
 EINSTEIN_CHAIN = (4, 1, 3, 0, 2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
 import tempfile
@@ -35,6 +36,8 @@ def _quiet() -> Iterator[None]:
     try:
         os.dup2(nowhere, 1)
         yield
+        with suppress(Exception):  # what C code has written and not yet sent
+            ctypes.CDLL(None).fflush(None)
     finally:
         os.dup2(kept, 1)
         os.close(kept)
