@@ -6,13 +6,23 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from hardware.body import Body as Body
 
+    # Heads.
+    from hardware.camera import Camera as Camera
+    from hardware.camera import CameraError as CameraError
+    from hardware.camera_opencv import OpenCVCamera as OpenCVCamera
+    from hardware.camera_video import VideoCamera as VideoCamera
+
     # The digital eye.
     from hardware.detectors import CascadeDetector as CascadeDetector
     from hardware.detectors import Detector as Detector
     from hardware.detectors import LBPDetector as LBPDetector
+    from hardware.dynamixel import Dynamixel as Dynamixel
+    from hardware.feetech import Feetech as Feetech
     from hardware.fovea import Fovea as Fovea
-
-    # Heads.
+    from hardware.maestro import Maestro as Maestro
+    from hardware.motors import MotorError as MotorError
+    from hardware.motors import Motors as Motors
+    from hardware.pan_tilt_camera import PanTiltCamera as PanTiltCamera
     from hardware.panorama_head import PanoramaHead as PanoramaHead
     from hardware.photo import PhotoError as PhotoError
     from hardware.photo import read_photo as read_photo
@@ -38,6 +48,16 @@ _FILES = {
     "Simulated": "simulated",
     # Heads.
     "PanoramaHead": "panorama_head",
+    "PanTiltCamera": "pan_tilt_camera",
+    "Camera": "camera",
+    "CameraError": "camera",
+    "OpenCVCamera": "camera_opencv",
+    "VideoCamera": "camera_video",
+    "Motors": "motors",
+    "MotorError": "motors",
+    "Dynamixel": "dynamixel",
+    "Feetech": "feetech",
+    "Maestro": "maestro",
     # The digital eye.
     "CascadeDetector": "detectors",
     "Detector": "detectors",
