@@ -93,6 +93,8 @@ class MaestroBus(ServoBus):
         self.device, self.crc = device, crc
         self.told: dict[int, int] = {}
         self.seen: dict[int, int] = {}
+        # Whether an answer may still be on its way, for waiting for it was given up or interrupted.
+        self.late = False
         self.line = serial_port(self.port, baud, patience)
 
     def _range(self, motor: int) -> tuple[int, int]:
@@ -136,9 +138,14 @@ class MaestroBus(ServoBus):
             raise Garbled(f"heard {heard[0]}")
 
     def _ask(self, command: int, *data: int, length: int) -> bytes:
+        # Answers do not say what they answer: one that comes late must not be taken for the next.
+        while self.late and self.line.read(64):
+            pass
         self.line.reset_input_buffer()
+        self.late = True
         self._send(command, *data)
         answer = self.line.read(length)
+        self.late = len(answer) < length
         if len(answer) < length:
             raise Garbled("does not answer")
         return answer

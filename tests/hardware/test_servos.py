@@ -318,19 +318,20 @@ def test_motors_that_nobody_needs_any_more_let_go(kind, start):
         assert not any(servo.torque for servo in port.servos.values())
 
 
-def test_an_interrupt_within_a_packet(kind, start, monkeypatch):
+@pytest.mark.parametrize("way", ["read", "write"])
+def test_an_interrupt_within_a_packet(kind, start, way, monkeypatch):
     port, motors = start(kind)
     motors.move([0, 0])
     line = motors.bus.line
-    name = "readPort" if kind == "dynamixel" else "read"
-    read, left = getattr(line, name), [2]
+    name = f"{way}Port" if kind == "dynamixel" else way
+    works, left = getattr(line, name), [2]
 
-    def interrupted(length):
+    def interrupted(what):
         # The second finds torque being turned off.
         if left[0]:
             left[0] -= 1
             raise KeyboardInterrupt
-        return read(length)
+        return works(what)
 
     monkeypatch.setattr(line, name, interrupted)
     with pytest.raises(KeyboardInterrupt):
