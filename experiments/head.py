@@ -151,7 +151,7 @@ def _camera(word: str) -> Any:
 
 
 def _tell(console: Console, movements: list[Movement], names: list[int]) -> None:
-    table = Table("motor", "command", "pixels right", "pixels down", "back to", "verdict", box=None)
+    table = Table("motor", "command", "pixels right", "pixels down", "back within", "verdict", box=None)
     for name, movement in zip(names, movements, strict=True):
         right, down = movement.pixels
         row = f"{movement.command:+.2f}", f"{right:+.1f}", f"{down:+.1f}", f"{movement.left:.1f}", movement.verdict
