@@ -183,7 +183,8 @@ def test_no_camera_is_one_sentence(tmp_path):
 
 def test_a_video_that_no_motor_moves(tmp_path, video):
     with FakeFeetech() as port:
-        code, said, complaint = apmodels(tmp_path, "head", "check", "--feetech", port.name, "--camera", str(video))
+        words = ["--feetech", port.name, "--camera", str(video), "--settle", "0"]
+        code, said, complaint = apmodels(tmp_path, "head", "check", *words)
         assert code == 1 and not complaint and row(said, 1)[2].startswith("moves nothing")
         assert [servo.torques for servo in port.servos.values()] == [[1, 0], [1, 0]]
 

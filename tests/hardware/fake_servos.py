@@ -134,7 +134,7 @@ def crc16(data):
 class FakeDynamixel(FakePort):
     """XL330s by protocol 2, ids from 1."""
 
-    def __init__(self, count=2, speed=4000.0, low=0, high=4095, mode=3, position=2048):
+    def __init__(self, count=2, speed=20000.0, low=0, high=4095, mode=3, position=2048):
         self.mode, self.velocity = mode, {}
         super().__init__({i + 1: Servo(position, low, high, speed) for i in range(count)})
 
@@ -209,7 +209,7 @@ class FakeDynamixel(FakePort):
 class FakeFeetech(FakePort):
     """STS3215s, or SCS servos, ids from 1."""
 
-    def __init__(self, count=2, speed=4000.0, order="little", steps=4096, low=None, high=None, mode=0, position=None):
+    def __init__(self, count=2, speed=20000.0, order="little", steps=4096, low=None, high=None, mode=0, position=None):
         self.order, self.mode, self.paces = order, mode, {}
         low, high = 0 if low is None else low, steps - 1 if high is None else high
         middle = steps // 2 if position is None else position

@@ -35,7 +35,8 @@ def start():
         fakes, motors = KINDS[kind]
         port = fakes(**(fake or {}))
         made.append(port)
-        made.insert(0, motors(port.name, **(PATIENT | given)))
+        quick = {"speed": 8000.0} if kind == "maestro" else {}
+        made.insert(0, motors(port.name, **(PATIENT | quick | given)))
         return port, made[0]
 
     yield start
@@ -281,7 +282,7 @@ def test_something_in_its_way(kind, start):
 
 
 def test_a_cable_that_is_pulled_in_a_movement(kind, start):
-    port, motors = start(kind, {} if kind == "maestro" else {"speed": 800.0})
+    port, motors = start(kind, **({"speed": 1000.0} if kind == "maestro" else {"fake": {"speed": 800.0}}))
     motors.move([0, 0])
     port.pull_past = port.servos[motors.bus.ids[0]].position + 100
     begin = time.monotonic()
