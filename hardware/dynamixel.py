@@ -23,8 +23,8 @@ STATE = 122, 14
 STEPS = 4096
 # Degrees a second in a step of profile velocity, 0.229 revolutions a minute.
 VELOCITY = 0.229 * 6
-# Modes that go to positions: plain, over many turns, and with a limit of current.
-POSITION_MODES = (3, 4, 5)
+# The mode that goes to positions within one turn. In others a servo's own limits do not count.
+POSITION_MODE = 3
 ALERT, BAD_CRC = 128, 3
 FAULTS = {0: "a wrong voltage", 2: "overheating", 3: "an encoder fault", 4: "an electrical shock", 5: "overload"}
 
@@ -88,10 +88,10 @@ class DynamixelBus(ServoBus):
 
     def _range(self, motor: int) -> tuple[int, int]:
         mode = self._read(motor, OPERATING_MODE)[0]
-        if mode not in POSITION_MODES:
+        if mode != POSITION_MODE:
             raise MotorError(
-                f"Motor {motor} on {self.port} is in mode {mode}, and only moves to positions in modes 3, 4 and 5; set "
-                "it with the Dynamixel Wizard."
+                f"Motor {motor} on {self.port} is in mode {mode}, and is needed in mode 3, position control; set it "
+                "with the Dynamixel Wizard."
             )
         return _number(self._read(motor, MIN_POSITION)), _number(self._read(motor, MAX_POSITION))
 
@@ -99,12 +99,13 @@ class DynamixelBus(ServoBus):
         state = self._read(motor, STATE)
         return _number(state[10:]), state[0] == 1
 
+    def _pace(self, motor: int) -> None:
+        self._write(motor, PROFILE_VELOCITY, self.velocity)
+
     def _aim(self, motor: int, position: int) -> None:
         self._write(motor, GOAL_POSITION, position)
 
     def _torque(self, motor: int, on: bool) -> None:
-        if on:
-            self._write(motor, PROFILE_VELOCITY, self.velocity)
         self._write(motor, TORQUE_ENABLE, int(on), whatever=not on)
 
     def _shut(self) -> None:

@@ -86,8 +86,8 @@ class FeetechBus(ServoBus):
     def _range(self, motor: int) -> tuple[int, int]:
         if self.series == "STS" and (mode := self._read(motor, MODE)[0]) != 0:
             raise MotorError(
-                f"Motor {motor} on {self.port} is in mode {mode}, and only moves to positions in mode 0; set it with "
-                "Feetech's debugging program."
+                f"Motor {motor} on {self.port} is in mode {mode}, and is needed in mode 0, position control; set it "
+                "with Feetech's debugging program."
             )
         low, high = self._number(self._read(motor, MIN_POSITION)), self._number(self._read(motor, MAX_POSITION))
         # Both 0 is no limit.
@@ -97,12 +97,13 @@ class FeetechBus(ServoBus):
         state = self._read(motor, STATE)
         return self._number(state[:2]), state[10] == 1
 
+    def _pace(self, motor: int) -> None:
+        self._write(motor, SPEED, self.speed)
+
     def _aim(self, motor: int, position: int) -> None:
         self._write(motor, GOAL_POSITION, position)
 
     def _torque(self, motor: int, on: bool) -> None:
-        if on:
-            self._write(motor, SPEED, self.speed)
         self._write(motor, TORQUE, int(on), whatever=not on)
 
     def _shut(self) -> None:

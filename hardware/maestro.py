@@ -89,7 +89,7 @@ class MaestroBus(ServoBus):
         patience: float,
     ):
         super().__init__(port, ids, retries)
-        self.pace, self.acceleration = pace(speed, SPEED, 0x3FFF), acceleration
+        self.speed, self.acceleration = pace(speed, SPEED, 0x3FFF), acceleration
         self.device, self.crc = device, crc
         self.told: dict[int, int] = {}
         self.seen: dict[int, int] = {}
@@ -113,14 +113,17 @@ class MaestroBus(ServoBus):
         self.seen[motor] = position
         return position, self._ask(GET_MOVING, length=1) != b"\0" and position != self.told[motor]
 
+    def _pace(self, motor: int) -> None:
+        self._tell(SET_SPEED, motor, self.speed)
+        self._tell(SET_ACCELERATION, motor, self.acceleration)
+
     def _aim(self, motor: int, position: int) -> None:
         self._tell(SET_TARGET, motor, position)
         self.told[motor] = position
 
     def _torque(self, motor: int, on: bool) -> None:
         if on:
-            self._tell(SET_SPEED, motor, self.pace)
-            self._tell(SET_ACCELERATION, motor, self.acceleration)
+            # A target is enough.
             return
         self._tell(SET_TARGET, motor, 0)
         if self._ask(GET_POSITION, motor, length=2) != b"\0\0":

@@ -57,6 +57,10 @@ class ServoBus(ABC):
         """Where it is, and whether it moves."""
 
     @abstractmethod
+    def _pace(self, motor: int) -> None:
+        """Set how fast it goes."""
+
+    @abstractmethod
     def _aim(self, motor: int, position: int) -> None:
         """Say where to go."""
 
@@ -85,7 +89,8 @@ class ServoBus(ABC):
         leave_by_exit()
         # First, for an interrupt may come between any two lines.
         self.on.add(motor)
-        # Whatever it was told long ago must not make it jump.
+        # Whatever it was told long ago must not make it jump; nor must it hurry, if it is past a limit.
+        self._again(motor, lambda: self._pace(motor))
         self.aim(motor, position)
         self._again(motor, lambda: self._torque(motor, True))
 

@@ -14,14 +14,15 @@ import tty
 class Servo:
     """A motor: it moves toward its goal at its speed while its torque is on.
 
-    ``stop`` is where something is in its way; ``torques`` are all values that its torque was set to.
+    ``stop`` is where something is in its way; ``torques`` are all values that its torque was set to,
+    ``goals`` all its goals, and ``written`` all addresses that were written to.
     """
 
     def __init__(self, position, low, high, speed):
         self.position, self.goal, self.low, self.high, self.speed = position, position, low, high, speed
         self.torque, self.torques, self.stop, self.overloaded = 0, [], None, False
         self.since = time.monotonic()
-        self.goals = []
+        self.goals, self.written = [], []
 
     def update(self):
         now = time.monotonic()
@@ -191,6 +192,7 @@ class FakeDynamixel(FakePort):
 
     def write(self, name, servo, address, data):
         value = int.from_bytes(data, "little", signed=True)
+        servo.written.append(address)
         match address, len(data):
             case 64, 1:
                 # In shutdown it does not take hold again before its power was off.
@@ -235,6 +237,7 @@ class FakeFeetech(FakePort):
             return self.status(name, servo, self.table(servo)[data[0] : data[0] + data[1]])
         assert packet[4] == 3
         value = int.from_bytes(data[1:], self.order)
+        servo.written.append(data[0])
         match data[0], len(data) - 1:
             case 40, 1:
                 servo.set_torque(value and not servo.overloaded)

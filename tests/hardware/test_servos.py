@@ -148,6 +148,13 @@ def test_speeds(start):
         start("feetech", speed=-1.0)
 
 
+@pytest.mark.parametrize("kind", ["dynamixel", "feetech"])
+def test_speed_comes_before_the_first_goal_and_torque_after_it(kind, start):
+    port, motors = start(kind)
+    motors.move([0, 0])
+    assert port.servos[1].written == ([112, 116, 64, 116] if kind == "dynamixel" else [46, 42, 40, 42])
+
+
 def test_scs_servos_put_the_greater_byte_first(start):
     port, motors = start("feetech", {"order": "big", "steps": 1024}, series="SCS")
     motors.move([0.5, 0])

@@ -32,7 +32,7 @@ def slow(kind):
 def ended(kind, program, stop=None):
     """Run a program that moves motors; return its exit code, what it complained of, and the fake port."""
     with slow(kind) as port:
-        given = "motors.bus.pace = 1\n" if kind == "Maestro" else ""
+        given = "motors.bus.speed = 1\n" if kind == "Maestro" else ""
         text = PROGRAM.format(kind=kind, port=port.name, program=given + program)
         command = [sys.executable, "-c", text]
         environment = os.environ | {"OMP_NUM_THREADS": "1"}
