@@ -14,13 +14,14 @@ import tty
 class Servo:
     """A motor: it moves toward its goal at its speed while its torque is on.
 
-    ``stop`` is where something is in its way; ``torques`` are all values that its torque was set to,
-    ``goals`` all its goals, and ``written`` all addresses that were written to.
+    ``stop`` is where something is in its way; one that ``trembles`` never stands still. ``torques`` are all values that
+    its torque was set to, ``goals`` all its goals, and ``written`` all addresses that were written to.
     """
 
     def __init__(self, position, low, high, speed):
         self.position, self.goal, self.low, self.high, self.speed = position, position, low, high, speed
         self.torque, self.torques, self.stop, self.overloaded = 0, [], None, False
+        self.trembles = False
         self.since = time.monotonic()
         self.goals, self.written = [], []
 
@@ -35,7 +36,7 @@ class Servo:
 
     @property
     def moving(self):
-        return bool(self.torque) and self.position not in (self.goal, self.stop)
+        return bool(self.torque) and (self.trembles or self.position not in (self.goal, self.stop))
 
     def set_torque(self, on):
         self.update()
@@ -56,14 +57,14 @@ class FakePort:
     """A pseudo-terminal with servos at its other end.
 
     Faults: ``deaf`` requests are not heard, ``bent`` ones are heard with a wrong bit, ``mute`` answers are not sent,
-    ``garbled`` ones have a wrong checksum, each so many times. ``pull()`` pulls the cable, and ``pull_past`` does when
-    a servo is past that position.
+    ``garbled`` ones have a wrong checksum, each so many times, after ``skip`` requests that are well. ``pull()`` pulls
+    the cable, and ``pull_past`` does when a servo is past that position.
     """
 
     def __init__(self, servos):
         self.servos = servos
         self.deaf = self.bent = self.mute = self.garbled = 0
-        self.pull_past, self.requests = None, []
+        self.skip, self.pull_past, self.requests = 0, None, []
         self.buffer = b""
         self.master, self.slave = os.openpty()
         tty.setraw(self.slave)
@@ -89,6 +90,11 @@ class FakePort:
     def answer_all(self):
         while (found := self.packet()) is not None:
             self.requests.append(found)
+            if self.skip:
+                self.skip -= 1
+                if answer := self.answer(found):
+                    os.write(self.master, answer)
+                continue
             if self.deaf:
                 self.deaf -= 1
                 continue

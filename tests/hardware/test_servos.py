@@ -228,6 +228,40 @@ def test_packets_that_are_lost_are_sent_again(kind, start, fault):
     assert [port.servos[i].torques for i in motors.bus.ids] == [[1], [1]]
 
 
+@pytest.mark.parametrize("fault", ["deaf", "bent", "mute"])
+def test_any_one_packet_may_be_lost(kind, start, fault):
+    crc = {"crc": True} if kind == "maestro" else {}
+    port, motors = start(kind, crc, patience=0.05, **crc)
+    servos = [port.servos[i] for i in motors.bus.ids]
+    middle = 6000 if kind == "maestro" else 2048
+    # Of a first move and of torque off; 50 are more than those are.
+    for skip in range(50):
+        for servo in servos:
+            servo.position, servo.goal, servo.speed = middle - 48, 0, 1e9
+        port.skip = skip
+        setattr(port, fault, 1)
+        motors.home()
+        assert [servo.goal for servo in servos] == [middle, middle]
+        assert [servo.torque for servo in servos] == [1, 1]
+        # A Maestro does not say what speed it was told: one that it did not hear at all is lost.
+        if kind == "maestro" and fault != "deaf":
+            assert [servo.speed for servo in servos] == [32_000, 32_000]
+        motors.relax()
+        assert [servo.torque for servo in servos] == [0, 0]
+        if getattr(port, fault):
+            break
+    assert 10 < skip < 49
+
+
+def test_a_target_that_a_maestro_does_not_hear_is_told_again(start):
+    port, motors = start("maestro")
+    motors.move([0, 0])
+    # The first packet of a move is the target; the Maestro knows of no error then.
+    port.deaf = 1
+    motors.move([0.2, 0])
+    assert port.deaf == 0 and port.servos[0].goal == 6320
+
+
 def lasting(port, motors, fault):
     """Move with a fault that does not go away before the move has failed; return what was said."""
     relax = motors.bus.relax
@@ -286,6 +320,18 @@ def test_something_in_its_way(kind, start):
     servo.stop = None
     motors.move([0.2, 0])
     assert servo.torque == 1
+
+
+def test_a_slow_motor_is_not_stuck_and_one_that_trembles_is_there(start):
+    port, motors = start("feetech", {"speed": 800.0}, timeout=0.2)
+    begin = time.monotonic()
+    motors.move([0.5, 0])
+    assert time.monotonic() - begin > 0.35
+    port.servos[2].trembles = True
+    motors.move([0, 0])
+    port.servos[2].stop = 2048
+    with pytest.raises(MotorError, match="in its way"):
+        motors.move([0, 0.5])
 
 
 def test_a_cable_that_is_pulled_in_a_movement(kind, start):
