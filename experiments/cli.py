@@ -17,6 +17,7 @@ from rich.console import Console
 TOOLS: dict[str, tuple[str, str]] = {
     "contingency": ("experiments.contingency_listen:main", "was anybody answering, in a recording and its calls?"),
     "data": ("experiments.data.__main__:main", "fetch the real data that studies and tests use"),
+    "head": ("experiments.head:main", "does each motor of a head move what its camera sees? (head check)"),
 }
 GROUPS = ("model", "engine", "controller", "body", "launcher")
 
@@ -140,10 +141,11 @@ def fail(message: str, code: int = 2) -> None:
 def is_users(error: BaseException) -> bool:
     """Whether an error speaks to a user; anything else is our mistake, and keeps its traceback."""
     from apmodels import DeclarationError, ValueOutOfRange
-    from hardware import PhotoError, SoundError
+    from hardware import CameraError, MotorError, PhotoError, SoundError
     from inference import Refusal
 
-    return isinstance(error, (PhotoError, SoundError, Refusal, DeclarationError, ValueOutOfRange, OSError))
+    ours = CameraError, MotorError, PhotoError, SoundError, Refusal, DeclarationError, ValueOutOfRange
+    return isinstance(error, (*ours, OSError))
 
 
 def _near(path: Path) -> str:

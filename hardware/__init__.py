@@ -6,16 +6,28 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from hardware.body import Body as Body
 
+    # Heads.
+    from hardware.camera import Camera as Camera
+    from hardware.camera import CameraError as CameraError
+    from hardware.camera_opencv import OpenCVCamera as OpenCVCamera
+    from hardware.camera_video import VideoCamera as VideoCamera
+
     # The digital eye.
     from hardware.detectors import CascadeDetector as CascadeDetector
     from hardware.detectors import Detector as Detector
     from hardware.detectors import LBPDetector as LBPDetector
+    from hardware.dynamixel import Dynamixel as Dynamixel
+    from hardware.feetech import Feetech as Feetech
     from hardware.fovea import Fovea as Fovea
 
     # Heads.
     from hardware.heads import DiegoSan as DiegoSan
     from hardware.heads import Einstein as Einstein
     from hardware.heads import Nobody as Nobody
+    from hardware.maestro import Maestro as Maestro
+    from hardware.motors import MotorError as MotorError
+    from hardware.motors import Motors as Motors
+    from hardware.pan_tilt_camera import PanTiltCamera as PanTiltCamera
     from hardware.panorama_head import PanoramaHead as PanoramaHead
     from hardware.people import Person as Person
     from hardware.phantom_limbs import PhantomLimbs as PhantomLimbs
@@ -54,6 +66,16 @@ _FILES = {
     "PhantomLimbs": "phantom_limbs",
     "PhysicsHead": "physics_head",
     "Room": "room",
+    "PanTiltCamera": "pan_tilt_camera",
+    "Camera": "camera",
+    "CameraError": "camera",
+    "OpenCVCamera": "camera_opencv",
+    "VideoCamera": "camera_video",
+    "Motors": "motors",
+    "MotorError": "motors",
+    "Dynamixel": "dynamixel",
+    "Feetech": "feetech",
+    "Maestro": "maestro",
     # The digital eye.
     "CascadeDetector": "detectors",
     "Detector": "detectors",
