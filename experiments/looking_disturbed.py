@@ -107,13 +107,14 @@ def crowd(config: Any, folder: Path, console: Console) -> Result:
     head = make_head(config.head)
     engine = RaoBlackwell(instantiate(config.model, motors=head.motors), particles=1)
     portraits = data.files("tabler", "avatars/*.jpg")
-    parts, summary = [], {}
+    parts: list[xr.Dataset] = []
+    summary: dict[str, float] = {}
     for distance in tracked(distances, "distances"):
         setting = [OmegaConf.to_yaml(part) for part in (config.head, config.model, config.people)]
         setting += [seeds, movements, config.reach, config.seed, distance]
 
         def make(distance: float = distance) -> xr.Dataset:
-            learned = []
+            learned: list[xr.Dataset] = []
             for seed in range(seeds):
                 random = np.random.default_rng([config.seed, seed])
                 head.gather(_people(config.people, distance, portraits, random))

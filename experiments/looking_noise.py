@@ -37,7 +37,7 @@ def noise(config: Any, folder: Path, console: Console) -> Result:
     seeds, movements = (1, QUICK) if config.quick else (seeds, movements)
     head = make_head(config.head)
     engine = RaoBlackwell(instantiate(config.model, motors=head.motors), particles=1)
-    parts = []
+    parts: list[xr.Dataset] = []
     for seed in tracked(range(seeds), "seeds"):
         setting = [OmegaConf.to_yaml(config.head), OmegaConf.to_yaml(config.model), movements, config.reach, seed]
         setting += [config.seed, config.slip]

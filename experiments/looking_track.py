@@ -70,7 +70,8 @@ def _face(portrait: Path) -> np.ndarray:
     if not len(boxes):
         raise ValueOutOfRange(f"no face is found in portrait {portrait.name}; choose another")
     row, column, high, wide = max(boxes, key=lambda box: box[2])
-    around = cv2.copyMakeBorder(image, *[int(high)] * 4, cv2.BORDER_REPLICATE)
+    edge = int(high)
+    around = cv2.copyMakeBorder(image, edge, edge, edge, edge, cv2.BORDER_REPLICATE)
     top, left = int(row + high / 2), int(column + wide / 2)
     return around[top : top + 2 * int(high), left : left + 2 * int(high)]
 

@@ -5,22 +5,16 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from hardware.body import Body as Body
-
-    # Heads.
     from hardware.camera import Camera as Camera
     from hardware.camera import CameraError as CameraError
     from hardware.camera_opencv import OpenCVCamera as OpenCVCamera
     from hardware.camera_video import VideoCamera as VideoCamera
-
-    # The digital eye.
     from hardware.detectors import CascadeDetector as CascadeDetector
     from hardware.detectors import Detector as Detector
     from hardware.detectors import LBPDetector as LBPDetector
     from hardware.dynamixel import Dynamixel as Dynamixel
     from hardware.feetech import Feetech as Feetech
     from hardware.fovea import Fovea as Fovea
-
-    # Heads.
     from hardware.heads import DiegoSan as DiegoSan
     from hardware.heads import Einstein as Einstein
     from hardware.heads import Nobody as Nobody
@@ -39,8 +33,6 @@ if TYPE_CHECKING:
     from hardware.physics_head import PhysicsHead as PhysicsHead
     from hardware.room import Room as Room
     from hardware.simulated import Simulated as Simulated
-
-    # Sound.
     from hardware.sound import Microphone as Microphone
     from hardware.sound import SoundError as SoundError
     from hardware.sound import Speaker as Speaker
