@@ -6,7 +6,6 @@ derivative (thesis eqs 6.31 to 6.40).
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import torch
@@ -15,6 +14,7 @@ from torch.distributions import Distribution
 
 from apmodels.distributions import base_of
 from apmodels.laws import Laws
+from inference.worlds.cut import Cut, log_density, see_cut
 from inference.worlds.frame import Frame
 
 # Image by variable: the mean and the variance, (b, n, *shape).
@@ -36,6 +36,7 @@ class FieldBlock:
         # What every step adds to the variance of images that always move in the same way; and those that never move.
         self.added: dict[str, Tensor] = {}
         self.still: set[str] = set()
+        self.cuts: dict[str, Cut] = {}
 
     def start(self, frame: Frame, befores: dict[str, str | Tensor]) -> Images:
         """Return the images before time began."""
@@ -135,6 +136,9 @@ class FieldBlock:
     def _seen(
         self, name: str, source: str, frame: Frame, image: tuple[Tensor, Tensor], value: Tensor
     ) -> tuple[tuple[Tensor, Tensor], Tensor]:
+        cut = self.cuts.setdefault(name, Cut()).find(lambda numbers: self._law(name, frame, numbers), image[0])
+        if cut is not None:
+            return see_cut(cut, image, value)
         mean, variance = image
         centre, spread = self.shown(name, {source: image}, frame)
         lead = torch.broadcast_shapes(centre.shape[:2], value.shape[:2])
@@ -145,9 +149,7 @@ class FieldBlock:
         back = self._back(name, frame, wide[0])
         after = wide[0] + wide[1] * back(surprise * weight)
         shrunk = wide[1] - wide[1] ** 2 * back(weight.expand(*lead, *weight.shape[2:]))
-        score = -0.5 * (surprise**2 * weight + spread.log() + math.log(2 * math.pi))
-        score = torch.where(missing, 0.0, score).flatten(2).sum(-1)
-        return (after, shrunk.clamp(min=0)), score
+        return (after, shrunk.clamp(min=0)), log_density(surprise, weight, spread, missing)
 
     def _back(self, name: str, frame: Frame, image: Tensor) -> Any:
         """The way from what is seen to where it was: the transpose of the move."""

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from apmodels.simulation import Values
 from apmodels.structure import Structure
+from inference.worlds.cut import APART, FAR
 from inference.worlds.field_block import FieldBlock, Images
 from inference.worlds.frame import Frame
 from inference.worlds.gaussian import Gaussian
@@ -19,9 +20,6 @@ from inference.worlds.plan import Plan
 
 # A displacement is looked for within so many of its standard deviations.
 REACH = 2.5
-# Coordinates begin here, so that what comes in from outside is told from what has a place.
-FAR = 10_000.0
-APART = 6
 
 
 class NoTranslation(Exception):
