@@ -29,7 +29,7 @@ class LearningToLook(Model):
         brightness: mean of the scene before it is seen (µ_0,L).
         contrast: its standard deviation (σ_0,L).
         change: of how the scene changes from command to command (σ_L).
-        noise: of the camera's pixels (σ_Y).
+        noise: of the camera's pixels, and of all that turning does to them but shift them (σ_Y).
         bias: whether there may also be a movement that is the same whatever the command (eq. 6.7).
     """
 
