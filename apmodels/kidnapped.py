@@ -15,6 +15,9 @@ from apmodels.variables import state
 class Kidnapped(LearningToLook):
     """Now and then all that was known of the scene is out of sight; how motors work stays as it was.
 
+    One particle keeps the more probable of both: ``belief.values["lost"]`` is 0 or 1. What an image has in common with
+    a scene that was seen is weighed against what any image might show, so ``contrast`` should be that of images.
+
     Args:
         kidnapping: how probable that is at a command.
     """

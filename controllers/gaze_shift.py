@@ -15,7 +15,8 @@ class GazeShift(Controller):
     """Moves what is seen to where it is wanted, by motors that are learned.
 
     Each motor's part is the less, the noisier it is and the less is known of it: E|m - (a + ã)u|² also has what is
-    not known of a, whose entries are taken to be independent. No motor is told more than its space allows.
+    not known of a, whose entries are taken to be independent. No motor is told more than its space allows. What is seen
+    40 pixels to the right of the middle is looked at by ``aim(torch.tensor([-40.0, 0.0]))``: it shall move to the left.
 
     Args:
         engine: of a model with a hidden variable (D, K) by which an action (K,) moves something in D directions.
