@@ -43,7 +43,22 @@ class GazeShift(Controller):
         if not isinstance(space, Box) or space.shape != (hidden[by][1],):
             raise Refusal(f"GazeShift needs an action of {hidden[by][1]} numbers, a motor each; {name} is {space}")
         self.space, self.by, self.noise = space, by, noise
+        self._linear(name)
         self.aim(torch.zeros(hidden[by][0]) if goal is None else goal)
+
+    def _linear(self, action: str) -> None:
+        """Refuse a model whose gaze does not move by the matrix times the command."""
+        nodes, random = self.model.structure.nodes, torch.Generator().manual_seed(0)
+        for variable in self.model.declaration.of_role("state", "observation"):
+            parents = {parent.argument: parent.name for parent in variable.parents if not parent.lag}
+            if {self.by, action} <= set(parents.values()):
+                values = {name: torch.rand(nodes[name].shape, generator=random) for name in (self.by, action)}
+                given = {a: values[n] if n in values else torch.ones(nodes[n].shape) for a, n in parents.items()}
+                law = self.engine.laws.one(variable.name, given)
+                moved = law if isinstance(law, Tensor) else law.mean
+                if torch.allclose(moved.float(), values[self.by] @ values[action], rtol=1e-4, atol=1e-4):
+                    return
+        raise Refusal(f"GazeShift needs something that moves by {self.by} times {action}; here nothing does")
 
     def aim(self, goal: Tensor) -> None:
         """Say by how much what is seen shall move, (*batch, D), in the units of the variable."""
