@@ -45,8 +45,7 @@ class _ProbedWorlds(Worlds):
             self.laws_of = {}
             everybody = self.laws.variables.values()
             self.asked_for = {parent.name for other in everybody for parent in other.parents}
-        seen_once = variable.name in self.laws_of
-        if not seen_once:
+        if variable.name not in self.laws_of:
             arguments = self.parents(variable, values)
             law = self.laws.one(variable.name, {name: value[0] for name, value in arguments.items()})
             self.laws_of[variable.name] = law
@@ -124,18 +123,18 @@ class Probe:
 
         ``conjugate`` are those of them that could be selected from: a Beta above a Bernoulli, and so on.
         """
-        if not continuous:
-            return {}
         with torch.no_grad():
-            return self._kinds(child, continuous, conjugate)
+            return self._kinds(child, continuous, conjugate) if continuous else {}
 
     def _kinds(self, child: Variable, continuous: list[Parent], conjugate: list[Parent]) -> dict[str, Kind]:
         if conjugate and self._selects(child, continuous, conjugate):
             chosen = {p.argument: ("selects", "its probability is one of the components") for p in conjugate}
             rest = [p for p in continuous if p not in conjugate]
             return chosen | {p.argument: ("affine", "without effect at every probed world") for p in rest}
-        law = self.laws_of[child.name]
-        if isinstance(law, Distribution) and family(law) not in ("Normal", "MultivariateNormal"):
+        if isinstance(law := self.laws_of[child.name], Distribution) and family(law) not in (
+            "Normal",
+            "MultivariateNormal",
+        ):
             return {p.argument: ("nonlinear", f"a {family(law)} of a continuous variable") for p in continuous}
         return self._linearity(child, continuous)
 
@@ -151,7 +150,7 @@ class Probe:
                 kinds[parent.argument] = ("nonlinear", "not affine in it, all else fixed")
         # Bilinear laws: sample as few and as small parents as make the others affine together.
         for count in range(len(rest) + 1):
-            sets = sorted(itertools.combinations(rest, count), key=lambda some: sum(map(self._numel, some)))
+            sets = sorted(itertools.combinations(rest, count), key=lambda s: sum(self._value(p).numel() for p in s))
             for some in sets:
                 kept = [p for p in rest if p not in some]
                 if len(kept) < 2 or self._is_affine(child, kept):
@@ -165,8 +164,7 @@ class Probe:
     def is_smooth(self, child: Variable, parent: Parent) -> bool:
         """Tell whether a law moves at all when a parent moves by next to nothing, in some probed world."""
         here = {p.argument: self._value(p) for p in child.parents}
-        value = here[parent.argument]
-        if not value.is_floating_point():
+        if not (value := here[parent.argument]).is_floating_point():
             return False
         moved = here | {parent.argument: value * (1 + 1e-4) + 1e-4}
         try:
@@ -180,9 +178,6 @@ class Probe:
             (a != b).reshape(self.worlds, -1).any(1).double().mean() for a, b in pairs if a.numel() >= self.worlds
         ]
         return not changed or float(max(changed)) > 0.2
-
-    def _numel(self, parent: Parent) -> int:
-        return self._value(parent)[0].numel()
 
     def _value(self, parent: Parent) -> Tensor:
         return (self.previous if parent.lag else self.values)[parent.name]
@@ -202,35 +197,41 @@ class Probe:
         return tiled
 
     def _is_affine(self, child: Variable, moving: list[Parent]) -> bool:
-        continuous = [p for p in child.parents if self.pools[p.name] is None]
-        here = self._arguments(child, continuous)
+        here = self._arguments(child, [p for p in child.parents if self.pools[p.name] is None])
+        worlds = torch.arange(len(next(iter(here.values()))))
+        # Not more numbers at a time than an allocator keeps at hand.
+        most = max(1, IMAGES // max(value[0].numel() for value in here.values()))
+        return all(self._is_straight(child, {p.argument for p in moving}, here, some) for some in worlds.split(most))
+
+    def _is_straight(self, child: Variable, moving: set[str], here: Values, some: Tensor) -> bool:
+        """Whether a law is affine on lines from some worlds to others."""
         line = torch.tensor(LINE, dtype=self.laws.dtype)
-        worlds = len(next(iter(here.values())))
-        names = {p.argument for p in moving}
         moved = {}
         for name, value in here.items():
-            along = value[:, None]
-            if name in names:
+            along = value[some][:, None]
+            if name in moving:
                 t = line.reshape(1, -1, *[1] * (value.dim() - 1))
                 # Towards another world, all together; a little aside where that one is the same.
-                other = value.roll(1, 0)
-                along = along + t * (other - value + 1e-3 * (value == other))[:, None]
+                other = value[(some - 1) % len(value)][:, None]
+                along = along + t * (other - along + 1e-3 * (along == other))
             moved[name] = along
         try:
-            law = self.laws.many(child.name, moved, (worlds, len(LINE)))
+            law = self.laws.many(child.name, moved, (len(some), len(LINE)))
         except (ValueOutOfRange, DeclarationError):
             # A law that fails beyond the values that its parent takes is nonlinear enough.
             return False
         centre = law.to(self.laws.dtype) if isinstance(law, Tensor) else parameters(law)["loc"]
         spreads = [] if isinstance(law, Tensor) else [v for name, v in parameters(law).items() if name != "loc"]
         t = line.to(centre.dtype).reshape(1, -1, *[1] * (centre.dim() - 2))
-        predicted = centre[:, :1] + t * (centre[:, 1:2] - centre[:, :1])
-        return self._same(predicted, centre) and all(self._same(s[:, :1].expand_as(s), s) for s in spreads)
+        same = self._same(centre[:, :1] + t * (centre[:, 1:2] - centre[:, :1]), centre)
+        return same and all(self._same(s[:, :1].expand_as(s), s) for s in spreads)
 
     def _same(self, a: Tensor, b: Tensor) -> bool:
         """Whether values (W, line, ...) agree, by the scale of each component on each line: units do not matter."""
-        scale = torch.maximum(a.abs(), b.abs()).amax(1, keepdim=True)
-        return bool(((a - b).abs() <= self.tolerance * scale).all())
+        if torch.equal(a, b):
+            return True
+        scale = torch.maximum(*(torch.linalg.vector_norm(x, torch.inf, 1) for x in (a, b)))
+        return bool((torch.linalg.vector_norm(a - b, torch.inf, 1) <= self.tolerance * scale).all())
 
     def _moved(self, child: Variable, parent: Parent) -> str | None:
         arguments = {p.argument: self._value(p)[0] for p in child.parents}
