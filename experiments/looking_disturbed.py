@@ -105,13 +105,16 @@ def crowd(config: Any, folder: Path, console: Console) -> Result:
     if not distances or min(distances) <= 0 or sorted(distances) != distances:
         raise ValueOutOfRange(f"people stand at one distance or more, above 0 and growing, not at {distances}")
     head = make_head(config.head)
+    head.enter(Room(str(data.files("panorama", "*.jpg")[0]), tuple(config.room)))
+    if max(distances) > min(config.room[:2]) / 2:
+        raise ValueOutOfRange(f"people stand in the room, and not {max(distances):g} m away in {list(config.room)} m")
     engine = RaoBlackwell(instantiate(config.model, motors=head.motors), particles=1)
     portraits = data.files("tabler", "avatars/*.jpg")
     parts: list[xr.Dataset] = []
     summary: dict[str, float] = {}
     for distance in tracked(distances, "distances"):
         setting = [OmegaConf.to_yaml(part) for part in (config.head, config.model, config.people)]
-        setting += [seeds, movements, config.reach, config.seed, distance]
+        setting += [seeds, movements, config.reach, config.seed, distance, list(config.room)]
 
         def make(distance: float = distance) -> xr.Dataset:
             learned: list[xr.Dataset] = []

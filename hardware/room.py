@@ -12,8 +12,8 @@ import numpy as np
 
 from hardware.photo import as_photo
 
-# Pixels a metre of what is on the walls: as fine as 320 pixels over 50 degrees see from three metres.
-FINE = 120
+# How many pixels of what is on a wall are as long as it is far away: as fine as 320 pixels over 50 degrees see it.
+FINE = 360
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,8 @@ class Room:
         wide, deep, high = size
         self.low = np.array([-wide / 2, -deep / 2, -eyes])
         self.high = np.array([wide / 2, deep / 2, high - eyes])
+        # Pixels a metre.
+        self.fine = FINE / (min(wide, deep) / 2)
         if isinstance(scene, Sequence) and not isinstance(scene, str):
             if not scene:
                 raise ValueError("a room needs a picture.")
@@ -58,10 +60,10 @@ class Room:
         else:
             panorama = _grey(scene)
             # As coarse as the walls are, or what is seen would flicker.
-            share = min(1.0, 2 * math.pi * min(wide, deep) / 2 * FINE / panorama.shape[1])
+            share = min(1.0, 2 * math.pi * FINE / panorama.shape[1])
             panorama = cv2.resize(panorama, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
             paint = lambda i, rows, columns, points: _seen(panorama, points, turned)  # noqa: E731
-        self.surfaces = [_surface(i, *edges, paint) for i, edges in enumerate(self._edges())]
+        self.surfaces = [self._surface(i, *edges, paint) for i, edges in enumerate(self._edges())]
 
     def hit(self, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Return where rays from a place (3,) inside along directions (..., 3) meet a wall, (..., 3)."""
@@ -83,17 +85,16 @@ class Room:
             (corner(left, back, top), x, y),
         ]
 
+    def _surface(self, i: int, corner: np.ndarray, across: np.ndarray, down: np.ndarray, paint: Any) -> Surface:
+        columns, rows = (max(1, round(float(np.linalg.norm(edge)) * self.fine)) for edge in (across, down))
+        u, v = (np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows
+        points = corner + u[None, :, None] * across + v[:, None, None] * down
+        return Surface(corner, across, down, paint(i, rows, columns, points))
+
 
 def _grey(picture: Any) -> np.ndarray:
     image = as_photo(picture)
     return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
-
-
-def _surface(i: int, corner: np.ndarray, across: np.ndarray, down: np.ndarray, paint: Any) -> Surface:
-    columns, rows = (round(float(np.linalg.norm(edge)) * FINE) for edge in (across, down))
-    u, v = (np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows
-    points = corner + u[None, :, None] * across + v[:, None, None] * down
-    return Surface(corner, across, down, paint(i, rows, columns, points))
 
 
 def _seen(panorama: np.ndarray, points: np.ndarray, turned: float) -> np.ndarray:
