@@ -60,7 +60,8 @@ def lattice(seen, mean, variance, corner, motion, spread, outside):
     for right in range(-15, 16):
         for down in range(-15, 16):
             chance = sum(
-                Normal(m, s).log_prob(torch.tensor(float(x))) for m, s, x in zip(motion, spread, (right, down))
+                Normal(m, s).log_prob(torch.tensor(float(x)))
+                for m, s, x in zip(motion, spread, (right, down), strict=True)
             )
             top, left = corner[1] - down, corner[0] - right
             m, v = torch.full(seen.shape, outside[0]), torch.full(seen.shape, outside[1])
