@@ -1,4 +1,4 @@
-"""Every value of finite states is tried where one world is kept: against sums by hand, and other ways to say the same."""
+"""Where one world is kept, every value of finite states is tried: against sums by hand, and said in another order."""
 
 import math
 import warnings
