@@ -5,9 +5,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import lsq_linear
-
 from pyro.distributions import Normal
+from scipy.optimize import lsq_linear
 
 from apmodels import (
     Box,
