@@ -35,7 +35,7 @@ def test_noise_that_is_not_known_is_half_normal():
     assert float((found**2).mean()) == pytest.approx(49, rel=0.05)
 
 
-def babbled(particles, steps=25, unsteady=3.0):
+def babbled(particles, steps=20, unsteady=3.0):
     """What a head with one noisy motor comes to believe; its commands and movements."""
     model = MotorNoise(view=(6, 8), field=(30, 40), gain=6.0, wear=0.05, slip=0.5, unsteady=unsteady)
     engine, scene, place = RaoBlackwell(model, particles=particles, seed=1), picture(80, 100), torch.zeros(2)
@@ -54,7 +54,7 @@ def babbled(particles, steps=25, unsteady=3.0):
 
 
 def test_a_motor_that_strays_is_found_out():
-    belief, commands, moves = babbled(200)
+    belief, commands, moves = babbled(100)
     law = belief.marginal("straying")
     # Draws from the prior, weighed by how probable they make the movements.
     with seeded(0):
@@ -64,7 +64,7 @@ def test_a_motor_that_strays_is_found_out():
     for d in range(2):
         own = drawn[:, d] ** 2 @ (commands**2).T + 0.25 + 1 / 12
         weight = torch.softmax(
-            MultivariateNormal(torch.zeros(25), shared + torch.diag_embed(own)).log_prob(moves[:, d]), 0
+            MultivariateNormal(torch.zeros(20), shared + torch.diag_embed(own)).log_prob(moves[:, d]), 0
         )
         mean = weight @ drawn[:, d]
         spread = (weight @ (drawn[:, d] - mean) ** 2).sqrt()
@@ -82,7 +82,7 @@ def test_one_particle_cannot_tell_noise():
 
 def test_noise_is_found_from_movements_by_evidence():
     truth = NoisyMotors(gain=100.0, wear=0.5, slip=2.0, straying=STRAYING)
-    record = truth.simulate(250, batch=1, seed=1)
+    record = truth.simulate(70, batch=4, seed=1)
     begin = truth.replace(straying=torch.full((2, 2), 15.0))
     found = fit(begin, {name: record[name] for name in ("command", "motion")}, {"straying": "real"})
     assert torch.allclose(found.values["straying"].abs(), STRAYING, rtol=0.2, atol=3.0)
