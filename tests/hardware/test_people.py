@@ -18,7 +18,7 @@ people = st.builds(
     bearing=st.floats(-90, 90),
     up=st.floats(-1, 1),
     sway=st.floats(0, 0.5),
-    pace=st.floats(0, 60),
+    pace=st.one_of(st.just(0.0), st.floats(0.1, 60)),
     turn=st.floats(1, 120),
     phase=st.floats(0, 100),
 )
