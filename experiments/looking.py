@@ -34,12 +34,13 @@ FIXATIONS = 50
 
 def two_motors(config: Any, folder: Path, console: Console) -> Result:
     """Learn two motors; see ``conf/experiment/learning_to_look/two_motors.yaml``."""
+    at = _kept(config)
     found, summary = learned(config, folder, console)
     summary["fixation_error"] = max(summary[f"{name}.fixation_error"] for name in found)
     seen = {}
     for name, settings in config.heads.items():
         setting = [OmegaConf.to_yaml(settings), OmegaConf.to_yaml(config.model), list(config.scenes), config.seed]
-        make = lambda s=settings, n=name: _scenes(config, s, n)  # noqa: E731
+        make = lambda s=settings, n=name: _scenes(config, s, n, at)  # noqa: E731
         seen[name] = remembered(folder, f"scene_{name}", setting, make)
     datasets = {**found, **{f"scene_{name}": part for name, part in seen.items()}}
     return Result(summary, datasets, {"two_motors": draw_motors(found, off, KNOWN), "scene": draw_scenes(seen)})
@@ -55,6 +56,8 @@ def einstein(config: Any, folder: Path, console: Console) -> Result:
 
 def phantom_limbs(config: Any, folder: Path, console: Console) -> Result:
     """Learn which motors do nothing; see ``conf/experiment/learning_to_look/phantom_limbs.yaml``."""
+    if any(settings.get("phantoms", 0) < 1 for settings in config.heads.values()):
+        raise ValueOutOfRange("phantom_limbs needs heads with 1 phantom or more")
     found, summary = learned(config, folder, console)
     name, parts = next(iter(found.items()))
     real = parts.sizes["motor"] - config.heads[name].phantoms
@@ -220,12 +223,17 @@ def _fixations(head: Any, actuation: np.ndarray, random: np.random.Generator) ->
     return missed
 
 
-def _scenes(config: Any, settings: Any, name: str) -> xr.Dataset:
-    """What a head remembers of the scene on the way, every second pixel (Fig. 6.6)."""
-    head = make_head(settings)
+def _kept(config: Any) -> list[int]:
+    """After which movements scenes are kept."""
     at = sorted({movement for movement in config.scenes if movement <= QUICK[1] or not config.quick})
     if not at or at[0] < 1:
         raise ValueOutOfRange(f"scenes are kept after 1 movement or more, not {list(config.scenes)}")
+    return at
+
+
+def _scenes(config: Any, settings: Any, name: str, at: list[int]) -> xr.Dataset:
+    """What a head remembers of the scene on the way, every second pixel (Fig. 6.6)."""
+    head = make_head(settings)
     engine = RaoBlackwell(instantiate(config.model, motors=head.motors), particles=1)
     part = learn(head, engine, at[-1], config.reach, config.seed, keep=at)
     scene = part.scene[:, ::2, ::2].assign_coords(kept=at)

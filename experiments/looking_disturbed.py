@@ -34,6 +34,8 @@ def kidnapped(config: Any, folder: Path, console: Console) -> Result:
         raise ValueOutOfRange(
             f"a head is carried off after 2 movements or more, and watched for {ON_END} or more, not {at} and {after}"
         )
+    if config.photographs < 1:
+        raise ValueOutOfRange(f"another room has 1 photograph or more, not {config.photographs}")
     photographs = [str(path) for path in data.scenes()[: config.photographs]]
     elsewhere = Room(photographs)
     head, summary, found = make_head(config.head), {}, {}
@@ -104,12 +106,16 @@ def crowd(config: Any, folder: Path, console: Console) -> Result:
     distances = [float(distance) for distance in config.distances]
     if not distances or min(distances) <= 0 or sorted(distances) != distances:
         raise ValueOutOfRange(f"people stand at one distance or more, above 0 and growing, not at {distances}")
+    if config.people.count < 1:
+        raise ValueOutOfRange(f"a crowd is 1 or more, not {config.people.count}")
+    portraits = data.files("tabler", "avatars/*.jpg")
+    if config.people.count > len(portraits):
+        raise ValueOutOfRange(f"there are {len(portraits)} portraits, too few for {config.people.count} people")
     head = make_head(config.head)
     head.enter(Room(str(data.files("panorama", "*.jpg")[0]), tuple(config.room)))
     if max(distances) > min(config.room[:2]) / 2:
         raise ValueOutOfRange(f"people stand in the room, and not {max(distances):g} m away in {list(config.room)} m")
     engine = RaoBlackwell(instantiate(config.model, motors=head.motors), particles=1)
-    portraits = data.files("tabler", "avatars/*.jpg")
     parts: list[xr.Dataset] = []
     summary: dict[str, float] = {}
     for distance in tracked(distances, "distances"):

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 import inference
-from apmodels import MotorErrors, NoisyMotors
+from apmodels import MotorErrors, NoisyMotors, ValueOutOfRange
 from apmodels.progress import tracked
 from controllers.gaze_shift import gaze_shift
 from experiments.looking import RIGHT, astray, learn, make_head, size
@@ -35,6 +35,8 @@ def noise(config: Any, folder: Path, console: Console) -> Result:
     """Learn how far motors stray; see ``conf/experiment/learning_to_look/noise.yaml``."""
     seeds, movements = size(config)
     seeds, movements = (1, QUICK) if config.quick else (seeds, movements)
+    if not config.slip > 0:
+        raise ValueOutOfRange(f"a movement strays by more than 0 pixels, not {config.slip}")
     head = make_head(config.head)
     engine = RaoBlackwell(instantiate(config.model, motors=head.motors), particles=1)
     parts: list[xr.Dataset] = []

@@ -37,9 +37,12 @@ def track(config: Any, folder: Path, console: Console) -> Result:
             f"the face moves once or more, is looked for every frame or less often, and rests for two looks or more, "
             f"not {moves}, {config.look_every} and {config.rest}"
         )
+    portraits = data.files("tabler", "avatars/*.jpg")
+    if not 0 <= config.face < len(portraits):
+        raise ValueOutOfRange(f"portraits are 0 to {len(portraits) - 1}; there is no {config.face}")
+    face = _face(portraits[config.face])
     head = make_head(config.head)
     learned = watched(config, folder, head, 0).actuation.values
-    face = _face(data.files("tabler", "avatars/*.jpg")[config.face])
     found = {}
     for name, knows in (("with", True), ("without", False)):
         setting = [OmegaConf.to_yaml(config.head), OmegaConf.to_yaml(config.model), config.movements, config.seed]

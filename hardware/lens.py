@@ -40,9 +40,9 @@ class Lens:
         flat = directions[..., :2].astype(float) / directions[..., 2:] * self.focal
         c, s = math.cos(self.roll), math.sin(self.roll)
         x, y = flat[..., 0] * c + flat[..., 1] * s, flat[..., 1] * c - flat[..., 0] * s
-        corner, shrunk = (self.size[0] ** 2 + self.size[1] ** 2) / 4, np.ones_like(x)
-        for _ in range(20):
-            shrunk = 1 - self.distortion * np.minimum((x**2 + y**2) * shrunk**2 / corner, 1.5)
+        # From the radius r without distortion to p = r (1 - d p² / corner).
+        bent = 4 * self.distortion * (x**2 + y**2) / ((self.size[0] ** 2 + self.size[1] ** 2) / 4)
+        shrunk = 2 / (1 + np.sqrt(np.maximum(1 + bent, 0)))
         return np.stack([x * shrunk, -y * shrunk], -1)
 
     def ray(self, pixel: np.ndarray) -> np.ndarray:
@@ -60,7 +60,8 @@ class Lens:
     def pinhole(self) -> tuple[int, int]:
         """Return rows and columns of the undistorted image, as fine as this one, that shows all that this one does."""
         flat = np.abs(self.rays[..., :2] / self.rays[..., 2:]) * self.focal
-        columns, rows = 2 * np.ceil(flat.reshape(-1, 2).max(0) + 0.5).astype(int)
+        # Rays are rounded.
+        columns, rows = 2 * np.ceil(flat.reshape(-1, 2).max(0) + 0.499).astype(int)
         return int(rows), int(columns)
 
     def bend(self, image: np.ndarray) -> np.ndarray:

@@ -205,9 +205,10 @@ class PhysicsHead:
     def frames(self, action: Any, count: int, rate: float = 30.0) -> Tensor:
         """Turn by a command and return what is seen on the way, (count, rows, columns), at ``rate`` images a second."""
         self.send(action)
-        seen = []
+        begin, seen = self.time, []
         for frame in range(count):
-            self.wait((frame + 1) / rate - frame / rate)
+            # Ticks are whole: what one frame is too long by, the next is not.
+            self.wait(begin + (frame + 1) / rate - self.time)
             seen.append(self.look())
         return torch.stack(seen)
 

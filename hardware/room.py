@@ -67,7 +67,7 @@ class Room:
 
     def hit(self, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Return where rays from a place (3,) inside along directions (..., 3) meet a wall, (..., 3)."""
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore", over="ignore"):
             far = np.where(directions > 0, self.high - origin, self.low - origin) / directions
         far = np.where(directions == 0, np.inf, far)
         return origin + far.min(-1, keepdims=True) * directions

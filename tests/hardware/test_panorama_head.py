@@ -79,7 +79,7 @@ def test_slip_is_in_pixels_and_seeds_reproduce():
 
 @pytest.mark.parametrize("given", [{"gains": ((1.0,),)}, {"view": 180.0}, {"slip": -1.0}, {"distortion": 0.7}])
 def test_bad_heads(given):
-    with pytest.raises(ValueError, match=r"gains|view"):
+    with pytest.raises(ValueError, match=r"gains|view|noise"):
         head(**given)
 
 
