@@ -21,7 +21,7 @@ from experiments.study import Result, remembered
 from hardware import read_photo
 from inference import RaoBlackwell
 
-# A quick look: movements, and the share of the particles.
+# A quick look: movements.
 QUICK = 8
 
 
@@ -29,8 +29,11 @@ def lamp_posts(config: Any, folder: Path, console: Console) -> Result:
     """Learn where the scene repeats itself; see ``conf/experiment/learning_to_look/lamp_posts.yaml``."""
     seeds, movements = size(config)
     movements = min(movements, QUICK) if config.quick else movements
-    if not 1 <= config.repeats <= 72 or not config.particles:
-        raise ValueOutOfRange(f"a scene repeats itself 1 to 72 times, and particles are needed, not {config.repeats}")
+    if not 1 <= config.repeats <= 72 or not config.particles or not 0 <= config.unlike <= 1:
+        raise ValueOutOfRange(
+            "a scene repeats itself 1 to 72 times, mixed with a share in [0, 1] of what was there, and particles are "
+            f"needed, not {config.repeats}, {config.unlike} and {list(config.particles)}"
+        )
     scene = repeated(read_photo(data.files("panorama", "*.jpg")[0]), config.repeats, config.unlike)
     head = instantiate(config.head, panorama=scene)
     found, summary = {}, {}

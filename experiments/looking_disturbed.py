@@ -111,6 +111,11 @@ def crowd(config: Any, folder: Path, console: Console) -> Result:
     portraits = data.files("tabler", "avatars/*.jpg")
     if config.people.count > len(portraits):
         raise ValueOutOfRange(f"there are {len(portraits)} portraits, too few for {config.people.count} people")
+    if len(config.room) != 3 or min(config.room) <= 0 or min(config.people.height, config.people.sway) < 0:
+        raise ValueOutOfRange(
+            f"a room has a width, a depth and a height, and people a height and a sway, not {list(config.room)}, "
+            f"{config.people.height} and {config.people.sway}"
+        )
     head = make_head(config.head)
     head.enter(Room(str(data.files("panorama", "*.jpg")[0]), tuple(config.room)))
     if max(distances) > min(config.room[:2]) / 2:
