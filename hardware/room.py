@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -63,7 +64,12 @@ class Room:
             share = min(1.0, 2 * math.pi * FINE / panorama.shape[1])
             panorama = cv2.resize(panorama, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
             paint = lambda i, rows, columns, points: _seen(panorama, points, turned)  # noqa: E731
-        self.surfaces = [self._surface(i, *edges, paint) for i, edges in enumerate(self._edges())]
+        self.paint = paint
+
+    @cached_property
+    def surfaces(self) -> list[Surface]:
+        """Its six sides, painted when they are first looked at."""
+        return [self._surface(i, *edges) for i, edges in enumerate(self._edges())]
 
     def hit(self, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Return where rays from a place (3,) inside along directions (..., 3) meet a wall, (..., 3)."""
@@ -85,11 +91,11 @@ class Room:
             (corner(left, back, top), x, y),
         ]
 
-    def _surface(self, i: int, corner: np.ndarray, across: np.ndarray, down: np.ndarray, paint: Any) -> Surface:
+    def _surface(self, i: int, corner: np.ndarray, across: np.ndarray, down: np.ndarray) -> Surface:
         columns, rows = (max(1, round(float(np.linalg.norm(edge)) * self.fine)) for edge in (across, down))
         u, v = (np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows
         points = corner + u[None, :, None] * across + v[:, None, None] * down
-        return Surface(corner, across, down, paint(i, rows, columns, points))
+        return Surface(corner, across, down, self.paint(i, rows, columns, points))
 
 
 def _grey(picture: Any) -> np.ndarray:
