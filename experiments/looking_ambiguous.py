@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from experiments.looking import learn, off, size
 from experiments.study import Result, remembered
 from hardware import read_photo
 from inference import RaoBlackwell
+from inference.rao_blackwell import DepletionWarning
 
 # A quick look: movements.
 QUICK = 8
@@ -44,7 +46,10 @@ def lamp_posts(config: Any, folder: Path, console: Console) -> Result:
             setting = [OmegaConf.to_yaml(config.head), OmegaConf.to_yaml(config.model), movements, config.reach]
             setting += [config.repeats, config.unlike, config.seed, seed, particles]
             make = lambda e=engine, s=seed: learn(head, e, movements, config.reach, config.seed + s)  # noqa: E731
-            parts.append(remembered(folder, f"{particles}_{seed}", setting, make))
+            with warnings.catch_warnings():
+                # Whether particles are enough is what the study is about.
+                warnings.simplefilter("ignore", DepletionWarning)
+                parts.append(remembered(folder, f"{particles}_{seed}", setting, make))
         name = f"particles_{particles}"
         found[name] = xr.concat(parts, "seed")
         last = off(found[name]).isel(movement=-1).values
