@@ -73,7 +73,7 @@ def phantom_limbs(config: Any, folder: Path, console: Console) -> Result:
     }
     console.print(
         f"what does nothing is found to do {summary['phantom_gain_median']:.2%} of what a motor does (median; worst "
-        f"{summary['phantom_gain']:.2%}), then below {KNOWN:.0%} after {summary['phantom_movements']:.0f} movements"
+        f"{summary['phantom_gain']:.2%}), then below {KNOWN:.0%} after {_count(summary['phantom_movements'])} movements"
     )
     figures = {"phantom_limbs": draw_gains(found), "learning": draw_motors(found, off, KNOWN)}
     return Result(summary, dict(found), figures)
@@ -269,6 +269,10 @@ def _median(values: list[float]) -> float:
     return float(np.median(values))
 
 
+def _count(movements: float) -> str:
+    return f"{movements:.0f}" if np.isfinite(movements) else "never"
+
+
 def _summary(name: str, found: xr.Dataset) -> dict[str, float]:
     wrong = off(found)
     counts = [first_within(wrong.sel(seed=s).values, KNOWN) for s in found.seed]
@@ -286,9 +290,10 @@ def _summary(name: str, found: xr.Dataset) -> dict[str, float]:
 
 def _tell(console: Console, name: str, summary: dict[str, float]) -> None:
     s = {key.partition(".")[2]: value for key, value in summary.items() if key.startswith(f"{name}.")}
+    first, worst = _count(s["movements"]), _count(s["movements_worst"])
     console.print(
-        f"{name}: within {KNOWN:.0%} of the truth first after {s['movements']:.0f} movements (median; worst "
-        f"{s['movements_worst']:.0f}); in the end {s['last_error_median']:.2%} (median; worst {s['last_error']:.2%}); "
+        f"{name}: within {KNOWN:.0%} of the truth first after {first} movements (median; worst {worst}); in the end "
+        f"{s['last_error_median']:.2%} (median; worst {s['last_error']:.2%}); "
         f"{s['wrong_matches']:.1%} of movements matched wrongly; what is looked at then comes within "
         f"{s['fixation_error']:.2%} of the image's width (median); {s['step_ms']:.0f} ms a step"
     )
