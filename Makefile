@@ -23,12 +23,15 @@ demo: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev]"
 	touch $@
 
+# A test a core, and a thread a test: more of them would only wait for each other.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses 8
+
 test: .venv/.tested lint
-	$(BIN)/python -m pytest
+	$(PYTEST)
 	$(BIN)/python -m pytest --nbmake notebooks
 
 slow: .venv/.tested
-	$(BIN)/python -m pytest -m slow
+	$(PYTEST) -m slow
 
 lint: .venv/.tested
 	$(BIN)/ruff check .

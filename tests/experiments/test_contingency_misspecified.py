@@ -69,6 +69,7 @@ def test_it_is_the_inference_that_is_wrong_and_not_the_control(study):
     assert (rhythm == len(range(0, int(data.attrs["steps"]), 5))).all()
 
 
+@pytest.mark.slow
 def test_a_seed_says_all(tmp_path):
     words = ("quick=true", "late=[2]", "bursts=[4]", "echoes=[1]", "chats=[]", "every=[6]")
     first, again, other = (run(tmp_path, "misspecified", *words, f"seed={seed}")[0] for seed in (3, 3, 4))
