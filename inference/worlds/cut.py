@@ -70,13 +70,16 @@ class Cut:
         return True
 
 
-def see_cut(piece: Piece, image: tuple[Tensor, Tensor], value: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor]:
+def see_cut(
+    piece: Piece, image: tuple[Tensor, Tensor], value: Tensor, own: bool = False
+) -> tuple[tuple[Tensor, Tensor], Tensor]:
     """Condition an image's mean and variance (rows, worlds, H, W) on what is seen of a piece of it.
 
     Args:
         piece: which pixels are seen.
         image: mean and variance.
         value: what is seen, (rows or 1, worlds or 1, h, w); NaN is missing.
+        own: whether the variance may be written upon.
 
     Returns:
         Mean and variance; log p(value), nats, (rows, worlds).
@@ -95,8 +98,11 @@ def see_cut(piece: Piece, image: tuple[Tensor, Tensor], value: Tensor) -> tuple[
     after = m + v * surprise * weight, (v - v * v * weight).clamp(min=0)
     found = []
     everywhere = bool(inside.all())
-    for old, new in zip(flat, after, strict=True):
-        if everywhere:
+    own = own and variance.shape[:2] == lead and variance.is_contiguous() and not variance.requires_grad
+    for old, new, ours in zip(flat, after, (False, own and not after[1].requires_grad), strict=True):
+        if everywhere and ours:
+            put = old.scatter_(2, number, new.flatten(2))
+        elif everywhere:
             put = old.scatter(2, number, new.flatten(2))
         else:
             put = old.clone(memory_format=torch.contiguous_format)

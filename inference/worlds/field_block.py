@@ -90,12 +90,12 @@ class FieldBlock:
         """Return the mean and the variance of an observation of images."""
         source = next(p.name for p in self.laws.variables[name].parents if p.name in self.group)
         mean, variance = now[source]
-        centre, noise = self._law(name, frame, mean)
-        nothing, _ = self._law(name, frame, torch.zeros_like(mean))
-        spread, _ = self._law(name, frame, variance)
+        centre, noise = self.law(name, frame, mean)
+        nothing, _ = self.law(name, frame, torch.zeros_like(mean))
+        spread, _ = self.law(name, frame, variance)
         return centre, spread - nothing + noise
 
-    def _law(self, name: str, frame: Frame, image: Tensor | None) -> tuple[Tensor, Tensor]:
+    def law(self, name: str, frame: Frame, image: Tensor | None) -> tuple[Tensor, Tensor]:
         """A law's mean and variance where its parent in the group is ``image``, (b, n, *shape)."""
         values = dict(frame.values)
         for parent in self.laws.variables[name].parents:
@@ -112,33 +112,34 @@ class FieldBlock:
     def _moved(self, name: str, frame: Frame, now: Images, past: Images) -> tuple[Tensor, Tensor]:
         source = next((p for p in self.laws.variables[name].parents if p.name in self.group), None)
         if source is None:
-            return self._law(name, frame, None)
+            return self.law(name, frame, None)
         mean, variance = (past if source.lag else now)[source.name]
         if name in self.still:
             return mean, variance + self.added[name]
-        centre, noise = self._law(name, frame, mean)
-        spread, _ = self._law(name, frame, variance)
+        centre, noise = self.law(name, frame, mean)
+        spread, _ = self.law(name, frame, variance)
         return centre, spread + self._added(name, frame, mean, noise)
 
     def _added(self, name: str, frame: Frame, mean: Tensor, noise: Tensor) -> Tensor:
         """The noise that a law adds, less what it makes of an image that is zero; once, if nothing else bears on it."""
         if name in self.added:
             return self.added[name]
-        nothing, _ = self._law(name, frame, torch.zeros_like(mean))
+        nothing, _ = self.law(name, frame, torch.zeros_like(mean))
         added = noise - nothing
         if all(p.name in self.group for p in self.laws.variables[name].parents) and not added.requires_grad:
             self.added[name] = added[:1, :1]
             numbers = torch.arange(mean[0, 0].numel(), dtype=mean.dtype).reshape(1, 1, *mean.shape[2:])
-            if torch.equal(self._law(name, frame, numbers)[0], numbers):
+            if torch.equal(self.law(name, frame, numbers)[0], numbers):
                 self.still.add(name)
         return added
 
     def _seen(
         self, name: str, source: str, frame: Frame, image: tuple[Tensor, Tensor], value: Tensor
     ) -> tuple[tuple[Tensor, Tensor], Tensor]:
-        cut = self.cuts.setdefault(name, Cut()).find(lambda numbers: self._law(name, frame, numbers), image[0])
+        cut = self.cuts.setdefault(name, Cut()).find(lambda numbers: self.law(name, frame, numbers), image[0])
         if cut is not None:
-            return see_cut(cut, image, value)
+            # An image that never moves got a new variance in this step, which is nobody else's.
+            return see_cut(cut, image, value, own=source in self.still and source in self.states)
         mean, variance = image
         centre, spread = self.shown(name, {source: image}, frame)
         lead = torch.broadcast_shapes(centre.shape[:2], value.shape[:2])
@@ -153,5 +154,5 @@ class FieldBlock:
 
     def _back(self, name: str, frame: Frame, image: Tensor) -> Any:
         """The way from what is seen to where it was: the transpose of the move."""
-        back: Any = torch.func.vjp(lambda x: self._law(name, frame, x)[0].expand(*image.shape[:2], -1, -1), image)[1]
+        back: Any = torch.func.vjp(lambda x: self.law(name, frame, x)[0].expand(*image.shape[:2], -1, -1), image)[1]
         return lambda value: back(value)[0]

@@ -108,6 +108,7 @@ class Offsets:
         parents = [p for state in self.block.states for p in bank.laws.variables[state].parents]
         self.still = all(p.name in self.block.group for p in parents)
         self.moved: Images | None = None
+        self.alike: tuple[Tensor, Tensor] | None = None
         self.sign = 0
 
     def choose(self, step: Any, prior: Gaussian, seen: Values, best: bool) -> tuple[Tensor, Tensor, Tensor]:
@@ -167,8 +168,16 @@ class Offsets:
                 keys = [(p.name, p.lag) for p in bank.laws.variables[name].parents]
                 frame.values[name, 0] = frame.in_all(bank.laws, name, frame.lead(keys))  # type: ignore[assignment]
         if not self.still or self.moved is None:
-            self.moved = self.block.moved(self._coordinates(step), frame)
-        return self.block.shown(self.seen, self.moved, frame)
+            self.moved = moved = self.block.moved(self._coordinates(step), frame)
+            source = next(p.name for p in bank.laws.variables[self.seen].parents if p.name in self.block.group)
+            least, most = torch.aminmax(moved[source][1].flatten(2), dim=-1)
+            self.alike = (moved[source][0], least[..., None, None]) if torch.equal(least, most) else None
+        if self.alike is None:
+            return self.block.shown(self.seen, self.moved, frame)
+        # All pixels have become as uncertain as each other: where one is shown, that is added.
+        numbers, uncertain = self.alike
+        centre, noise = self.block.law(self.seen, frame, numbers)
+        return centre, noise + torch.where(centre >= FAR - 0.5, uncertain, 0.0)
 
     def _coordinates(self, step: Any) -> Images:
         """Images of pixels' numbers, row by row, of which all are certain."""

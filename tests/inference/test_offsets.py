@@ -210,3 +210,18 @@ def test_a_motion_of_which_nothing_is_integrated_is_tried_as_before():
         moved.append(belief.values["motion"].round().flatten())
     # The first look may be anywhere: nothing has been seen before.
     assert [(m - moved[0]).tolist() for m in moved] == [[0, 0], [1, -1], [0, 1]]
+
+
+@pytest.mark.parametrize("particles", [1, 4])
+def test_an_update_leaves_the_belief_it_begins_from_as_it_was(particles):
+    engine = RaoBlackwell(SMALL, particles=particles)
+    belief = engine.start()
+    with seeded(0):
+        looks = torch.rand(3, 6, 8)
+    for look in looks:
+        kept = [(mean.clone(), variance.clone()) for images in belief.fields for mean, variance in images.values()]
+        after, again = (engine.update(belief, torch.tensor([0.1, 0.0]), look) for _ in range(2))
+        now = [pair for images in belief.fields for pair in images.values()]
+        assert all(torch.equal(a, b) for old, new in zip(kept, now, strict=True) for a, b in zip(old, new, strict=True))
+        assert torch.equal(after.log_evidence, again.log_evidence)
+        belief = after
