@@ -212,6 +212,7 @@ def test_a_motion_of_which_nothing_is_integrated_is_tried_as_before():
     assert [(m - moved[0]).tolist() for m in moved] == [[0, 0], [1, -1], [0, 1]]
 
 
+@pytest.mark.filterwarnings("ignore::inference.rao_blackwell.DepletionWarning")
 @pytest.mark.parametrize("particles", [1, 4])
 def test_an_update_leaves_the_belief_it_begins_from_as_it_was(particles):
     engine = RaoBlackwell(SMALL, particles=particles)
