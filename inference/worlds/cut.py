@@ -66,7 +66,8 @@ class Cut:
             most = torch.where(inside, origin, -torch.inf).amax((-2, -1))
             if bool((least < most).any()):
                 return False
-        self.known = True
+        # Where nothing is shown, nothing is learned of how.
+        self.known = self.known or bool(inside.any())
         return True
 
 
